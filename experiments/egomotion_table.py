@@ -39,7 +39,7 @@ from jaxevent.egomotion.truth import KnownMotion
 from jaxevent.errors import InputError
 from jaxevent.io.output import complete
 from jaxevent.recording import Recording
-from jaxevent.show.motion import fitted_velocity
+from jaxevent.show.motion import motion_at_fitted_depth
 from jaxevent.simulate import motion_scene
 
 FAST = 6.0, 12.0, 24.0  # rad/s
@@ -156,7 +156,7 @@ def score_method(sequence: Sequence, label: str, warm: set[tuple[str, str]]) -> 
     began = cpu()
     motion = estimate_motion(label, model, recording)
     spent = cpu() - began
-    known = fitted_velocity(recording, motion) if known is None else known
+    known = motion_at_fitted_depth(recording, motion) if known is None else known
     # Of a cut that is shorter all times count.
     settle, end = (SETTLE, END) if length > 2 * (SETTLE + END) - 0.01 else (0.0, 0.0)
     first, last = recording.start + round(1e6 * settle), recording.stop - round(1e6 * end)

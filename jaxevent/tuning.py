@@ -2,8 +2,8 @@
 
     fitted = jaxevent.optimise(loss, params, ["c_on", "c_off"], batches)
 
-`loss(params, batch)` is a scalar, the mean over what a batch holds; nothing else is known of the
-estimator. Several processes fit together: `jaxevent.processes`.
+`loss(params, batch)` is a scalar, the mean over the measurements of a batch; nothing else of the
+estimator is used. Several processes can share a fit: see `jaxevent.processes`.
 """
 
 import dataclasses
@@ -37,15 +37,16 @@ from jaxevent.progress import bar
 
 P = TypeVar("P", bound=Parameters)
 
-# Derivatives of so many numbers are computed forwards, of more in reverse. Loss and gradient of
-# the AKF on slider_depth (1.08 M events, 22 images, 2 cores): the loss alone 67 ms; forwards 135 ms
-# for 1 number, 181 ms for 2; in reverse 213 ms for any. Forwards over reverse, both in turn: 0.60
-# for 1 number, 0.80 for 2, 1.12 for 3, 1.15 for 4, 1.9 for 8, and 3.9 for 8 with 4 starts.
+# Forward mode is used for derivatives of up to this many numbers, reverse mode for more. Loss and
+# gradient of the AKF on slider_depth (1.08 M events, 22 images, 2 cores): the loss alone 67 ms;
+# forward 135 ms for 1 number, 181 ms for 2; reverse 213 ms for any. Forward over reverse, measured
+# alternately: 0.60 for 1 number, 0.80 for 2, 1.12 for 3, 1.15 for 4, 1.9 for 8, and 3.9 for 8 with
+# 4 starts.
 MAX_FORWARD_PARAMETERS = 2
 
-# A line on which a loss is probed, in unit steps: changes over 0.1 and 0.3 of one.
+# Points at which a loss is probed along a line, in unit steps: 0.1 and 0.3 of one apart.
 PROBE_STEPS = (-0.4, -0.1, 0.0, 0.1, 0.4)
-MIN_SKILL = 0.5  # of the gradient, below which a loss is rough
+MIN_SKILL = 0.5  # skill of the gradient below which a loss is rough
 NEGLIGIBLE_CHANGE = 1e-5  # of a loss, relative: single precision rounds sums by about 1e-6
 ROUGH_SEARCH_REACH, N_ROUGH_CANDIDATES = 6.4, 17  # unit steps to both sides: a factor of 600
 
@@ -56,14 +57,14 @@ Interval = tuple[float | int, float | int, int]
 
 @runtime_checkable
 class WeightedBatch(Protocol):
-    """A batch with a weight of its own in means over batches."""
+    """Batch with its own weight in means over batches."""
 
     weight: Any
 
 
 @dataclasses.dataclass(frozen=True)
 class LossWithPrior:
-    """A loss plus a Gaussian prior of some unconstrained numbers; `with_prior` makes it.
+    """Loss plus a Gaussian prior on some unconstrained numbers; made by `with_prior`.
 
     The prior adds weight / 2 ((u - centre) / spread)^2 for each of `terms`, (name, centre, spread),
     with u the unconstrained number, the logarithm of a positive one.
@@ -92,11 +93,11 @@ class PartwiseLossWithPrior(LossWithPrior):
     """A `jaxevent.confidence.PartwiseLoss` plus a prior."""
 
     def parts(self, params: Any, batch: Any) -> tuple[Array, Array]:
-        """Compute the loss of each part, with the prior's term, and its weight.
+        """Compute the loss of each part of a batch, with the prior's term, and its weight.
 
         Args:
             params: Parameters of an estimator.
-            batch: One batch, as the loss takes it.
+            batch: One batch, in the form that the loss takes.
 
         Returns:
             The mean of each part, (parts,), and its weight, (parts,).
@@ -115,15 +116,15 @@ def with_prior(
     """Add a log-normal prior to a loss.
 
     Args:
-        loss: The loss that `optimise` would minimise.
+        loss: A loss for `optimise`.
         params: Parameters of the class that is fitted.
-        prior: For each number (centre, spread): its expected value in its unit, and the standard
-            deviation of its logarithm (for a share in [0, 1) of ln(p / (1 - p))).
-        weight: Twice the cost of one standard deviation, in the loss's unit. For a loss that is the
-            mean of -ln p over n measurements 1 / n is Bayes' weight.
+        prior: (centre, spread) of each number: its expected value in its unit, and the standard
+            deviation of its logarithm, or of ln(p / (1 - p)) for a number p in [0, 1).
+        weight: Twice the cost of one standard deviation, in the loss's unit. If the loss is the
+            mean of -ln p over n measurements, 1 / n is the Bayesian weight.
 
     Returns:
-        A loss that `optimise` takes.
+        A loss for `optimise`.
 
     Raises:
         InputError: A number does not exist, a centre is not one of its values or has no logarithm,
@@ -156,15 +157,16 @@ def with_prior(
 class Settings:
     """Settings of `optimise`.
 
-    A round is a search of all searched parameters followed by `iterations` steps of Adam. Its rate
-    falls from `learning_rate`, halved with every round, to a tenth along a cosine. Every `every`
-    iterations the validation loss is computed; a start that has not improved for `patience`
-    iterations stops. The result is the best of these, with parameters within their bounds. `starts`
-    starting points are followed at once: the given one, and others drawn around it with a standard
-    deviation of `spread` in the unconstrained numbers. `batch` batches make a step, drawn without
-    replacement; None takes all. `forward` chooses the mode of differentiation; None takes the
-    faster. With `probe` the loss is probed before the first step: numbers whose gradient does not
-    predict how the loss changes (`gradient_skill`) are searched before they are followed.
+    A round searches all searched parameters, then takes `iterations` steps of Adam. The learning
+    rate falls along a cosine from `learning_rate`, which is halved with every round, to a tenth of
+    it. Every `every` iterations the validation loss is computed; a start that has not improved for
+    `patience` iterations stops. The result is the best point evaluated, with parameters within
+    their bounds. `starts` starting points are optimised at once: the given one, and others drawn
+    around it with a standard deviation of `spread` in the unconstrained numbers. A step uses
+    `batch` batches, drawn without replacement; None uses all. `forward` chooses forward or reverse
+    differentiation; None takes the faster. With `probe` the loss is probed before the first step:
+    numbers whose gradient does not predict how the loss changes (`gradient_skill`) are searched
+    first.
     """
 
     iterations: int = 300
@@ -181,11 +183,11 @@ class Settings:
 
 
 class RoughNumber(NamedTuple):
-    """A number in which the loss is rough.
+    """Result for a number in which the loss is rough.
 
     Attributes:
         skill: The gradient's skill at the start, see `gradient_skill`.
-        searched: Where the search before the descent ended, in the number's unit.
+        searched: Result of the search before the descent, in the number's unit.
     """
 
     skill: float
@@ -193,28 +195,28 @@ class RoughNumber(NamedTuple):
 
 
 class Position(eqx.Module):
-    """Parameters of all starting points.
+    """Parameters of all starting points, and the state of their optimisers.
 
-    Leaves of `raw`, `best`, `optimiser` begin with [starts].
+    The leading axis of the leaves of `raw`, `best` and `optimiser` is that of starts.
     """
 
     raw: dict[str, Array]  # the fitted parameters, unconstrained
     optimiser: Any
-    best: dict[str, Array]  # of this round
+    best: dict[str, Array]  # best `raw` of this round
     best_loss: Float[Array, " starts"]
-    best_at: Int[Array, " starts"]  # iteration
-    searched: dict[str, Array]  # common to all starts, unconstrained
+    best_at: Int[Array, " starts"]  # iteration of the best loss
+    searched: dict[str, Array]  # searched parameters, common to all starts, unconstrained
 
 
 @dataclasses.dataclass
 class Run:
-    """State of a fit that runs, as checkpoints hold it.
+    """State of a running fit, as checkpoints store it.
 
-    Stage 2 r is the search of round r, 2 r + 1 its descent; one last search follows. `tried` are
-    the losses of this search's candidates in order: the search is a function of them, so it is
-    taken up again by replaying it. `history` has start, round, iteration, fit loss and validation
-    loss (None where it was not looked at). `rough` has a `RoughNumber` for each number in which
-    the loss is rough.
+    Stage 2 r is the search of round r, 2 r + 1 its descent; one last search follows. `tried` holds
+    the losses of this search's candidates in order. The search depends on nothing else, so a
+    resumed search replays them. A row of `history` has start, round, iteration, fit loss and
+    validation loss (None where it was not computed). `rough` has a `RoughNumber` for each number
+    in which the loss is rough.
     """
 
     position: Position
@@ -227,13 +229,13 @@ class Run:
 
 @dataclasses.dataclass(frozen=True)
 class FitResult(Generic[P]):
-    """The parameters found, and how the fit came to them.
+    """The fitted parameters, and the losses along the fit.
 
     Attributes:
         params: The parameters.
         loss: Their validation loss; without validation their fit loss.
         history: Losses over iterations, see `Run`.
-        rough: Numbers in which the loss is rough, and which were searched first.
+        rough: Numbers in which the loss is rough, which were searched first.
     """
 
     params: P
@@ -243,9 +245,9 @@ class FitResult(Generic[P]):
 
     @property
     def diverged(self) -> bool:
-        """True if the last steps ended at a greater loss than the start, or at none that is finite.
+        """True if no start ended at a finite loss that is at most the initial one.
 
-        `params` are the best that were evaluated all the same.
+        Even so, `params` are the best that were evaluated.
         """
         seen = [line for line in self.history if line[4] is not None]
         lasts = {line[0]: line[4] for line in seen}  # by start
@@ -270,7 +272,7 @@ def begin(
         The state that `optimise` takes as `run`.
 
     Raises:
-        InputError: A name does not exist, has no gradient, or cannot start where it is.
+        InputError: A name does not exist, has no gradient, or has an initial value without one.
     """
     search = search or {}
     for name in [*names, *search]:
@@ -335,20 +337,20 @@ def optimise(
     Args:
         loss: `loss(params, batch)`, the mean over a batch's measurements; pure.
         params: Parameters at the start; those not named keep their values.
-        names: Parameters to follow the gradient of. Where a loss jumps as they change, its gradient
-            is not its slope; that of the AKF does with `ratio_width = 0`.
+        names: Parameters to fit by gradient. Where a loss jumps as they change, its gradient does
+            not predict its changes; the AKF's loss jumps with `ratio_width = 0`.
         batches: Pytrees, one compilation for each shape. A batch with an attribute `weight` counts
-            that much in means over batches. Or a function `prepare(params)` that gives batches to
-            fit to and batches to validate on, for parameters that act when batches are made. Of
-            several processes (`processes.join`) all give the same list and each computes its share;
-            a function gives `processes.REMOTE_BATCH` in place of what other processes compute.
+            that much in means over batches. Or a function `prepare(params)` that returns batches to
+            fit to and batches to validate on, for parameters that act when batches are made. With
+            several processes (`processes.join`) all pass the same list and each computes its share;
+            a function returns `processes.REMOTE_BATCH` for batches that others compute.
         validation: Batches for early stopping, if `batches` is a list; without any, the fit's.
         settings: See `Settings`.
         search: By name, (from, to, number of points): parameters searched without gradients, one
-            after another, by the fit loss of the best start. Every round looks at all points and
-            around the best, ever closer.
+            after another, by the fit loss of the best start. Every round evaluates all points and
+            searches around the best one, ever closer.
         run: State of an interrupted fit to continue; by default `begin(...)`.
-        save: Called with the run and whether to save it for sure, after every step.
+        save: Function of the run, called after every step, and of whether it must be saved.
         progress: Whether to show a bar; None shows it in a terminal or notebook.
         title: Name of the fit in the bar.
 
@@ -368,24 +370,25 @@ def optimise(
     total = settings.rounds * settings.iterations * bool(names)
     with bar(total=total, desc=title, unit="step", progress=progress) as loop.bar:
         if fresh:
-            loop.check()
+            loop.check_losses()
             loop.save(run, True)
         while run.stage <= 2 * settings.rounds:
             stage = loop.descend if run.stage % 2 else loop.search
             stage()
             run.stage, run.iteration, run.tried = run.stage + 1, 0, []
             loop.save(run, True)
-        fitted = loop.leader()
+        fitted = loop.best_params()
         least = loop.loss(fitted, loop.watched(fitted))
         return FitResult(fitted, least, run.history, run.rough)
 
 
 def gradient_skill(steps: ArrayLike, losses: ArrayLike, slopes: ArrayLike) -> float:
-    """Measure how well the slope of a loss predicts its changes along a line.
+    """Measure how well the gradient of a loss predicts its changes along a line.
 
-    From one point to the next the slope predicts the change h (g + g') / 2, exactly for a parabola.
-    With d the changes and e the errors of these predictions, the skill is 1 - sum e^2 / sum d^2.
-    A prediction of no change has the skill 0. Changes too small to matter count as predicted.
+    From one point to the next, h apart, the derivatives g and g' predict the change h (g + g') / 2,
+    which is exact for a parabola. With d the changes and e the errors of these predictions, the
+    skill is 1 - sum e^2 / sum d^2. A prediction of no change has the skill 0. Negligible errors
+    count as 0.
 
     Args:
         steps: (n,) points on the line, in ascending order.
@@ -404,7 +407,7 @@ def gradient_skill(steps: ArrayLike, losses: ArrayLike, slopes: ArrayLike) -> fl
 def _prediction_errors(
     steps: ArrayLike, losses: ArrayLike, slopes: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compare changes of a loss with those that its slope predicts.
+    """Compare changes of a loss with those that its derivative predicts.
 
     Args:
         steps: (n,) steps.
@@ -424,12 +427,12 @@ def _prediction_errors(
 
 
 def unit_step(number: Number, value: float, start: float) -> float:
-    """Return a unit step: 1 for numbers stored as logarithms, else the size of the number.
+    """Return the unit step of a stored number: 1 for a logarithm or logit, else the number's size.
 
     Args:
         number: The number.
-        value: Its value.
-        start: Its value at the start of a fit, whose size counts where it is larger.
+        value: Value of the number.
+        start: Value at the start of a fit; the larger of both sizes is taken.
 
     Returns:
         The step of the unconstrained number.
@@ -439,7 +442,7 @@ def unit_step(number: Number, value: float, start: float) -> float:
     return max(abs(value), abs(start)) or 1.0
 
 
-# A step whose gradient is not finite is left out, however many there are.
+# Any number of steps with a gradient that is not finite are skipped.
 ADAM_TRANSFORM = optax.apply_if_finite(optax.scale_by_adam(), max_consecutive_errors=2**31 - 1)
 
 
@@ -464,12 +467,12 @@ def _compute_losses(loss: Loss, params: Parameters, raw: dict[str, Array], batch
 
     Args:
         loss: The loss.
-        params: Parameters, in which those of the starts are put.
-        raw: Raw values of the parameters that vary, (starts, ...).
-        batch: Batch of the loss.
+        params: Parameters; those in `raw` are replaced.
+        raw: Unconstrained numbers by name, each (starts, ...).
+        batch: One batch.
 
     Returns:
-        (starts,), infinite where a parameter is out of bounds.
+        (starts,) losses, infinite where a parameter is out of bounds.
     """
 
     def value(one: dict[str, Array]) -> Array:
@@ -484,7 +487,7 @@ def _compute_losses(loss: Loss, params: Parameters, raw: dict[str, Array], batch
 def loss_and_grad(
     loss: Loss, forward: bool, params: Parameters, raw: dict[str, Array], batch: Any
 ) -> tuple[Array, dict[str, Array]]:
-    """Compute the loss of each start and its gradient by the unconstrained numbers.
+    """Compute the loss of each start and its gradient with respect to the unconstrained numbers.
 
     Args:
         loss: `loss(params, batch)`, a scalar.
@@ -514,12 +517,12 @@ def loss_and_grad(
 
 
 @jax.jit
-def _step(position: Position, slope: dict[str, Array], rate: float | Array) -> Position:
-    """Make a step of Adam from each start.
+def _adam_step(position: Position, slope: dict[str, Array], rate: float | Array) -> Position:
+    """Take a step of Adam from each start.
 
     Args:
         position: Parameters of all starts.
-        slope: Gradient by the raw values, each (starts, ...).
+        slope: Gradient with respect to `raw`, each (starts, ...).
         rate: Learning rate.
 
     Returns:
@@ -535,18 +538,16 @@ def _step(position: Position, slope: dict[str, Array], rate: float | Array) -> P
 def _update_best(
     position: Position, seen: Array, i: int | Array, patience: int | Array
 ) -> tuple[Position, Array]:
-    """Keep the best parameters of each start.
-
-    A start that has stopped keeps its best, however long the others go on.
+    """Update the best parameters of each start that has not stopped.
 
     Args:
         position: State of the fit.
-        seen: (starts,) losses that count.
+        seen: (starts,) validation losses of this iteration.
         i: Number of the iteration.
         patience: Iterations without improvement after which a start stops.
 
     Returns:
-        The state, and whether any start goes on.
+        The state, and whether any start continues.
     """
     first = i == 0
     going = first | (i - position.best_at < patience)
@@ -567,11 +568,11 @@ def _update_best(
 
 
 def map_batches(function: Callable[[Any], Any], batches: Sequence[Any]) -> list[tuple[float, Any]]:
-    """Apply a function to the batches of all processes.
+    """Apply a function to the batches of all processes, and gather the results.
 
     Args:
-        function: A function of a batch that gives a pytree of arrays.
-        batches: All batches, those of other processes as `processes.REMOTE_BATCH`.
+        function: A function of a batch that returns a pytree of arrays.
+        batches: All batches, with `processes.REMOTE_BATCH` for those of other processes.
 
     Returns:
         For each batch its weight and the function's value.
@@ -579,20 +580,20 @@ def map_batches(function: Callable[[Any], Any], batches: Sequence[Any]) -> list[
     if processes.is_single():
         return [(_weight(batch), function(batch)) for batch in batches]
     own = ((k, batch) for k, batch in enumerate(batches) if batch is not processes.REMOTE_BATCH)
-    mine = {k: (batch, function(batch)) for k, batch in own}  # before any is waited for
+    mine = {k: (batch, function(batch)) for k, batch in own}  # all are dispatched before any wait
     said = {k: (_weight(batch), jax.device_get(part)) for k, (batch, part) in mine.items()}
     gathered = {k: v for some in processes.allgather(said) for k, v in some.items()}
     values = (gathered[k] for k in range(len(batches)))
     return [(weight, jax.tree.map(jnp.asarray, value)) for weight, value in values]
 
 
-def _mean(function: Callable[[Any], Any], batches: Sequence[Any]) -> Any:
-    """Compute the mean of a function of batches (a pytree), weighted by the batches' `weight`.
+def _weighted_mean(function: Callable[[Any], Any], batches: Sequence[Any]) -> Any:
+    """Compute the mean of a function over batches, weighted by the batches' `weight`.
 
-    In several processes the results are added in the same order as on one.
+    Several processes add the results in the same order as one process does.
 
     Args:
-        function: The function.
+        function: Function of a batch that returns a pytree of arrays.
         batches: The batches.
     """
     found = map_batches(function, batches)
@@ -620,8 +621,8 @@ def batches_by_params(
         validation: Batches to validate on, if `batches` is a list.
 
     Returns:
-        A function from parameters to the batches to fit to and to validate on, which raises on all
-        processes the `InputError` of one.
+        A function from parameters to batches to fit to and batches to validate on. An `InputError`
+        of one process is raised on all.
     """
     if callable(batches):
         prepare: Callable[[Any], Batches] = batches  # ty: ignore[invalid-assignment]
@@ -654,7 +655,7 @@ class _Loop:
             numbers <= MAX_FORWARD_PARAMETERS if settings.forward is None else settings.forward
         )
 
-    def leader(self) -> Any:
+    def best_params(self) -> Any:
         """Return the parameters of the best start."""
         position = self.run.position
         best = int(jnp.argmin(position.best_loss))
@@ -666,10 +667,12 @@ class _Loop:
         return validation or fit
 
     def loss(self, params: Any, batches: Sequence[Any]) -> float:
-        return float(_mean(lambda batch: evaluate_loss(self.function, params, batch), batches))
+        return float(
+            _weighted_mean(lambda batch: evaluate_loss(self.function, params, batch), batches)
+        )
 
-    def check(self) -> None:
-        """Raise `InputError` unless the losses of the given parameters are finite."""
+    def check_losses(self) -> None:
+        """Raise `InputError` unless the losses of the initial parameters are finite."""
         fit, validation = self.prepare(self.params)
         if not fit:
             raise InputError("there is nothing to fit to; give recordings with images or positions")
@@ -681,8 +684,8 @@ class _Loop:
                 )
 
     def search(self) -> None:
-        """Search all searched parameters in turn, the others at the best start's values."""
-        replay, leader = iter(list(self.run.tried)), self.leader()
+        """Search the searched parameters one after another, with the others at the best start's."""
+        replay, leader = iter(list(self.run.tried)), self.best_params()
 
         def objective(name: str, value: float) -> float:
             """Compute the fit loss of a candidate; infinite if it is not a number.
@@ -697,7 +700,7 @@ class _Loop:
                 loss = self.loss(candidate, self.prepare(candidate)[0])
                 loss = loss if math.isfinite(loss) else math.inf
                 self.bar.set_postfix({name: f"{value:.4g}", "loss": f"{loss:.4g}"})
-                self._note(loss)
+                self._log_tried(loss)
             return loss
 
         for name, interval in self.intervals.items():
@@ -712,10 +715,10 @@ class _Loop:
             self._search_rough_numbers(replay)
 
     def _search_rough_numbers(self, replay: Iterator[float]) -> None:
-        """Probe the loss around the given start, and search the numbers in which it is rough.
+        """Probe the loss around the initial parameters, and search numbers in which it is rough.
 
-        A line along all numbers comes first. Suspect are those that change the loss by less than
-        the errors of all predictions together; these are probed one by one.
+        A line along all numbers is probed first. Numbers whose predicted changes are not large
+        against the errors of the predictions on that line are then probed one by one.
         """
         position = self.run.position
         params = self.params.with_raw(position.searched)
@@ -735,9 +738,9 @@ class _Loop:
             value = next(replay, None)
             if value is None:
                 function = functools.partial(_compute_losses, self.function, params, at)
-                value = float(_mean(function, batches)[0])
+                value = float(_weighted_mean(function, batches)[0])
                 value = value if math.isfinite(value) else math.inf
-                self._note(value)
+                self._log_tried(value)
             return value
 
         def gradient_along(names: Sequence[str], step: float) -> list[float]:
@@ -746,9 +749,9 @@ class _Loop:
             if known:
                 return known
             function = functools.partial(loss_and_grad, self.function, self.forward, params, at)
-            gradient = _mean(function, batches)[1]
+            gradient = _weighted_mean(function, batches)[1]
             found = [units[name] * float(gradient[name].sum()) for name in names]
-            self._note(*found)
+            self._log_tried(*found)
             return found
 
         def probe(names: Sequence[str]) -> tuple[list[float], list[float], NDArray[np.float64]]:
@@ -778,8 +781,8 @@ class _Loop:
         shifted = {n: leaf + (raw[n] - leaf[:1]) for n, leaf in position.raw.items()}
         self.run.position = dataclasses.replace(position, raw=shifted, best=shifted)
 
-    def _note(self, *values: float) -> None:
-        """Keep values that a resumed search replays."""
+    def _log_tried(self, *values: float) -> None:
+        """Log values, which a resumed search replays."""
         self.run.tried += values
         self.save(self.run, False)
 
@@ -788,7 +791,7 @@ class _Loop:
         return params.with_raw({name: raw})
 
     def descend(self) -> None:
-        """Take the gradient steps of a round, and move to the best parameters found."""
+        """Take the gradient steps of a round, then return to the best parameters found."""
         run, settings = self.run, self.settings
         position, turn = run.position, run.stage // 2
         if not position.raw:
@@ -803,7 +806,7 @@ class _Loop:
             i, seen = run.iteration, None
             if i % settings.every == 0 or i == settings.iterations:
                 objective = functools.partial(_compute_losses, self.function, params, position.raw)
-                seen = _mean(objective, watched)
+                seen = _weighted_mean(objective, watched)
                 position, going = _update_best(position, seen, i, settings.patience)
                 if i == settings.iterations or not bool(going):
                     self._record(turn, i, None, seen)
@@ -811,9 +814,11 @@ class _Loop:
             objective = functools.partial(
                 loss_and_grad, self.function, self.forward, params, position.raw
             )
-            losses, slope = _mean(objective, [fit[k] for k in self._draw_batches(len(fit))])
+            losses, slope = _weighted_mean(
+                objective, [fit[k] for k in self._draw_batches(len(fit))]
+            )
             fall = 0.55 + 0.45 * math.cos(math.pi * i / settings.iterations)
-            position = _step(position, slope, settings.learning_rate / 2**turn * fall)
+            position = _adam_step(position, slope, settings.learning_rate / 2**turn * fall)
             self._record(turn, i, losses, seen)
             run.position, run.iteration = position, i + 1
             self.bar.n = turn * settings.iterations + i + 1
@@ -822,7 +827,7 @@ class _Loop:
         run.position = dataclasses.replace(position, raw=position.best)
 
     def _draw_batches(self, count: int) -> Sequence[int]:
-        """Return the batches of this iteration: the next ones of successive random orders."""
+        """Return the indices of this iteration's batches, the next of successive permutations."""
         size = self.settings.batch
         if size is None or size >= count:
             return range(count)
@@ -840,10 +845,10 @@ class _Loop:
 
 
 def _search_smoothed(objective: Callable[[float], float]) -> float:
-    """Search a rough loss along a line, from 0 to `ROUGH_SEARCH_REACH` on both sides.
+    """Search a rough loss along a line, up to `ROUGH_SEARCH_REACH` on both sides of 0.
 
-    A point is judged by its loss and that of its neighbours, 1/4, 1/2, 1/4, so that no single dip
-    decides. Then the grid is made twice as fine around the best point, twice.
+    Losses are smoothed over neighbours with weights 1/4, 1/2, 1/4, so that no single dip decides.
+    The grid is then refined around the best point, twice.
     """
     grid = np.linspace(-ROUGH_SEARCH_REACH, ROUGH_SEARCH_REACH, N_ROUGH_CANDIDATES)
     best, width = 0.0, grid[1] - grid[0]
@@ -869,16 +874,17 @@ def _search_smoothed(objective: Callable[[float], float]) -> float:
 def _search_minimum(
     objective: Callable[[float], float], interval: Interval, value: float, turn: int
 ) -> float:
-    """Search one number for the least loss.
+    """Search the value of one number with the least loss.
 
-    Every turn evaluates all points of the interval, as the best one may change once the other
-    parameters have moved. The first turn adds the vertex of the parabola through the best point and
-    its neighbours; later turns approach the minimum around the best by Brent's method.
+    Every round evaluates all points of the interval, as the best one may change once the other
+    parameters have moved. The first round adds the vertex of the parabola through the best point
+    and its neighbours; later rounds approach the minimum around the best by Brent's method.
+
     Args:
-        objective: The loss of a value.
+        objective: Loss as a function of the value.
         interval: Lowest and highest value, and the number of points.
         value: Present value, which is among the candidates.
-        turn: Number of the turn, from 0.
+        turn: Number of the round, from 0.
 
     Returns:
         The best value.
@@ -890,7 +896,7 @@ def _search_minimum(
     k = int(np.argmin(losses))
     best = min((losses[k], grid[k]), (objective(value), value))
     if turn:
-        from scipy.optimize import minimize_scalar  # half a second that few runs need
+        from scipy.optimize import minimize_scalar  # an import of half a second, rarely needed
 
         reach, middle = step / 2 ** (turn - 1), min(max(best[1], low), high)
         found = minimize_scalar(

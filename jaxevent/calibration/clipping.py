@@ -7,23 +7,24 @@ from numpy.typing import NDArray
 
 from jaxevent.recording import Recording
 
-MAX_FRAMES, MAX_FRAME_PIXELS = 16, 1 << 15  # that are looked at, evenly spaced
+MAX_FRAMES, MAX_FRAME_PIXELS = 16, 1 << 15  # evenly spaced frames and pixels that are examined
 N_LEVELS = 255
 WINDOW_LEVELS = 3  # width of a pile-up: noise of up to about one grey level
-NEIGHBOUR_LEVELS = 16  # below a pile-up, with which it is compared
-# Grey values of frames that do not clip end in a tail, which falls: their ratio is below 1.5.
+NEIGHBOUR_LEVELS = 16  # levels below a pile-up with which it is compared
+# In frames that do not clip the histogram ends in a falling tail: its ratio is below 1.5.
 MIN_PILE_UP_RATIO = 4.0
-MIN_PILE_UP_PIXELS = 50  # so that it is no chance
+MIN_PILE_UP_PIXELS = 50  # fewer can be chance
 MAX_STRAY_SHARE = 1e-3  # of the pixels, beyond a pile-up
-# Pixels beyond the fullest level of a pile-up for one on it. Nothing is brighter than white; noise
-# of a bright surface goes both ways: of a quarter of a level, 2 % is more than half a level off.
+# Pixels beyond the fullest level of a pile-up, relative to those on it. Nothing is brighter than
+# white, but noise of a bright surface goes both ways: with a standard deviation of a quarter of a
+# level, 2 % of the pixels are more than half a level off.
 MAX_BEYOND_RATIO = 0.02
-# Of the pixels. A few that are white are taken as they are: what they hide is no loss in frames
-# that clip as well, and a guess of it is carried into the pixels beside them.
+# Share of the pixels. Fewer white pixels are left as they are: their error does not count in frames
+# that clip as well, and a guess of their excess would spread to the pixels beside them.
 MIN_CLIPPED_SHARE = 0.05
-MAX_CLIPPED_SHARE = 0.9  # beyond there is nothing to compare with
-BAND = 0.35  # ln I, the range below white whose density is continued beyond it
-# Of the exponential continuation, in simulated scenes: the density has modes beyond white.
+MAX_CLIPPED_SHARE = 0.9  # of more pixels there is nothing to compare with
+EXCESS_BAND_LOG = 0.35  # ln I, range below white whose density is extrapolated beyond white
+# Factor on the exponential extrapolation in simulated scenes: the density has modes beyond white.
 EXCESS_FACTOR, EXCESS_BOUNDS = 0.4, (0.1, 2.0)
 
 
@@ -32,10 +33,10 @@ class ClippedEnd(NamedTuple):
 
     | field | meaning |
     |---|---|
-    | level | grey value (0 to 1) beyond which pixels are clipped; None where none are |
-    | share | part of the pixels in the pile-up and beyond |
-    | ratio | pixels in the pile-up for one among its neighbours, at least `MIN_PILE_UP_RATIO` |
-    | excess | mean distance beyond white that is expected of clipped pixels, ln I |
+    | level | grey value (0 to 1) beyond which pixels are clipped; None if none are |
+    | share | share of the pixels in the pile-up and beyond |
+    | ratio | pixels in the pile-up over those in the fullest window of as many levels below |
+    | excess | expected mean distance of clipped pixels beyond white, ln I |
     """
 
     level: float | None
@@ -55,9 +56,9 @@ def find_clipping(recording: Recording) -> ClippedEnds:
     """Find the grey values at which a recording's frames clip, from the frames alone.
 
     Clipped pixels pile up at the last grey value that occurs. Three levels there are compared with
-    the fullest three of the 16 levels inside of them, and nothing may lie beyond the fullest one.
-    White may be any level. Saturation below the last level that the file can hold, with noise of
-    its own above a quarter of a level, is not told from a bright wall and not found.
+    the fullest three adjacent ones of the 16 levels before them, and nothing may lie beyond the
+    fullest level. White may be any level. Saturation below the file's last level whose noise
+    exceeds a quarter of a level cannot be distinguished from a bright wall, and is not found.
     """
     frames = recording.frames
     if frames is None or not len(frames):
@@ -106,20 +107,21 @@ def _find_pile_up(counts: NDArray[np.int64]) -> ClippedEnd:
 def _expected_excess(recording: Recording, grey: NDArray, level: float, share: float) -> float:
     """Return the mean distance of clipped pixels beyond white, ln I.
 
-    If the density of ln I falls exponentially, with mean m, from the band below white on, then the
-    band holds exp(BAND / m) - 1 pixels for each one beyond white.
+    If the density of ln I falls exponentially, with mean m, from the lower end of the band on, then
+    the band holds exp(EXCESS_BAND_LOG / m) - 1 pixels for each one beyond white.
 
     Args:
         recording: The recording, for its response.
         grey: (n,) grey values of sampled pixels, 0 to 1.
         level: Grey value beyond which pixels are clipped.
-        share: Part of the pixels beyond it.
+        share: Share of the pixels beyond it.
+
 
     Returns:
         The excess, ln I, within `EXCESS_BOUNDS`.
     """
     intensity = np.asarray(recording.response.intensity(np.append(grey, level)))
     light, white = intensity[:-1], intensity[-1]
-    band = float(((light < white) & (light >= white * np.exp(-BAND))).mean())
-    mean = BAND / np.log1p(band / share) if band else np.inf
+    band = float(((light < white) & (light >= white * np.exp(-EXCESS_BAND_LOG))).mean())
+    mean = EXCESS_BAND_LOG / np.log1p(band / share) if band else np.inf
     return float(np.clip(EXCESS_FACTOR * mean, *EXCESS_BOUNDS))

@@ -64,7 +64,7 @@ def add(commands: Any) -> None:
         help="TOML file, e.g. of particles = 400, or params.toml of a fit",
     )
     one.add_argument("--seed", metavar="N", type=int, default=0, help="seed of random numbers")
-    _add_known(one)
+    _add_truth_options(one)
     one.add_argument(
         "--rate", metavar="HZ", type=float, default=1000.0, help="rows per second; default: 1000"
     )
@@ -95,7 +95,7 @@ def add(commands: Any) -> None:
     arguments.add_output(one, "--out", metavar="DIR", help="folder to write; needed without --live")
 
 
-def _add_known(one: Any) -> None:
+def _add_truth_options(one: Any) -> None:
     """Add options for ground truth: a table, poses, the gyro."""
     one.add_argument(
         "--truth",
@@ -169,18 +169,18 @@ def run(**given: Any) -> None:
     if options.live:
         _print_live(options, kind)
     else:
-        _write(options, kind)
+        _estimate_and_write(options, kind)
 
 
-def _write(options: Options, kind: "type[Model] | None") -> None:
-    """Write the motion of a recording; without a `kind` its model is chosen."""
+def _estimate_and_write(options: Options, kind: "type[Model] | None") -> None:
+    """Estimate the motion of a recording and write it; if `kind` is None, select the model."""
     from jaxevent.egomotion.truth import imu_rotation as rotation_of
     from jaxevent.runs.egomotion import find_estimator
     from jaxevent.show.motion import Output
 
     _check_options(options, kind)
     assert options.out is not None
-    turned = None if options.imu_rotation is None else rotation_of(options.imu_rotation)
+    gyro_rotation = None if options.imu_rotation is None else rotation_of(options.imu_rotation)
     output = Output(options.out, options.rate, options.truth, flow=options.flow)
     whole = _open(options)
     arguments.warn_of_faults(whole, frames=False)
@@ -190,9 +190,9 @@ def _write(options: Options, kind: "type[Model] | None") -> None:
     if kind is None:
         kind, recording, choice = _select_model(recording)
     estimator = find_estimator(options.method or kind.best_method)
-    _check(estimator, kind, options)
-    _need_camera(recording, kind)
-    true = output.known(whole, kind, bias, turned, options.depth)
+    _check_method(estimator, kind, options)
+    _require_camera(recording, kind)
+    true = output.make_reference(whole, kind, bias, gyro_rotation, options.depth)
     clock = time.perf_counter()
     settings: dict[str, Any] = {"model": kind, "seed": options.seed, "progress": show_progress()}
     if options.causal:
@@ -201,9 +201,14 @@ def _write(options: Options, kind: "type[Model] | None") -> None:
         settings["smooth"] = options.smooth or not options.centred
     is_default = not (options.method or options.params or options.causal or options.smooth)
     estimator, motion, values = estimate_or_fall_back(
-        estimator, recording, options.params, settings, (options.imu, bias, turned), is_default
+        estimator,
+        recording,
+        options.params,
+        settings,
+        (options.imu, bias, gyro_rotation),
+        is_default,
     )
-    motion = _include_doubts(motion, recording, choice, options.focal)
+    motion = _add_uncertainties(motion, recording, choice, options.focal)
     seconds = time.perf_counter() - clock
     about = {
         "seed": options.seed, "smooth": settings.get("smooth", False), "gyro": options.imu,
@@ -228,17 +233,17 @@ def _check_options(options: Options, kind: "type[Model] | None") -> None:
     if options.out is None:
         raise InputError("there is nowhere to write; give a folder, --out DIR, or --live")
     if kind is not None:
-        _check(find_estimator(options.method or kind.best_method), kind, options)
+        _check_method(find_estimator(options.method or kind.best_method), kind, options)
     if options.causal and (options.centred or options.smooth):
         raise InputError("--causal uses no later events; leave out --centred and --smooth")
     arguments.check_seed(options.seed)
 
 
 def _open(options: Options) -> "Recording":
-    """Open the recording with its camera; it must hold events, and the IMU that options need."""
+    """Open the recording with its camera, and check that it has events and any IMU required."""
     path = options.path
     recording, _ = arguments.open_named(path, options.reading)
-    recording = _with_camera(recording, options.focal)
+    recording = _with_focal_length(recording, options.focal)
     if not len(recording.events):
         raise InputError(f"{path}: holds no events; choose another recording")
     recording.refuse_one_time(str(path))
@@ -251,7 +256,7 @@ def _open(options: Options) -> "Recording":
 
 
 def _gyro_bias(options: Options, recording: "Recording") -> "NDArray[np.float64] | None":
-    """Return the gyro's rates (3,), rad/s, while the camera is still; None without --still."""
+    """Return the gyro's mean rates (3,), rad/s, during --still; None without that option."""
     from jaxevent.egomotion.truth import gyro_bias
 
     if recording.imu is None or options.still is None:
@@ -260,7 +265,8 @@ def _gyro_bias(options: Options, recording: "Recording") -> "NDArray[np.float64]
 
 
 def _select_model(recording: "Recording") -> "tuple[type[Model], Recording, ModelSelection]":
-    """Select a model by the recording; return it, the recording with its lens, and the test."""
+    """Select a model for a recording; return it, the recording with its camera, and the test."""
+
     from jaxevent.egomotion.model_selection import select_model
 
     choice = select_model(recording)
@@ -270,13 +276,13 @@ def _select_model(recording: "Recording") -> "tuple[type[Model], Recording, Mode
     return choice.model, recording, choice
 
 
-def _include_doubts(
+def _add_uncertainties(
     motion: "MotionEstimate",
     recording: "Recording",
     choice: "ModelSelection | None",
     focal: float | None,
 ) -> "MotionEstimate":
-    """Add the uncertainty of model, focal length (px) and parts of the image to a motion."""
+    """Add the uncertainties of model, focal length (px) and inconsistent flow to a motion."""
     if choice is not None:
         motion = choice.include_doubt(motion)
     if focal is not None:
@@ -288,7 +294,7 @@ def _include_doubts(
 
 
 def _print_live(options: Options, kind: "type[Model] | None") -> None:
-    """Print rows of motion.csv as events come, each as soon as an estimate after it is there."""
+    """Print rows of motion.csv as events arrive, each once an estimate after it is available."""
     from jaxevent.egomotion import voting
     from jaxevent.show.motion import LiveTable
 
@@ -302,9 +308,9 @@ def _print_live(options: Options, kind: "type[Model] | None") -> None:
     if kind is None:
         raise InputError("--live cannot see all events to choose a model; name it by --model")
     recording, chunks = arguments.open_live(options.path, options.reading)
-    recording = _with_camera(recording, options.focal)
-    _need_camera(recording, kind)
-    values, _ = _parameters(voting, kind, options.params)
+    recording = _with_focal_length(recording, options.focal)
+    _require_camera(recording, kind)
+    values, _ = _load_params(voting, kind, options.params)
     size = recording.width, recording.height
     live = voting.live(size, values, model=kind, camera=recording.camera, seed=options.seed)
     table = LiveTable(live, float(options.rate))
@@ -315,8 +321,8 @@ def _print_live(options: Options, kind: "type[Model] | None") -> None:
     print(table.rows(), end="", flush=True)
 
 
-def _check(estimator: "MotionEstimator", kind: "type[Model]", options: Options) -> None:
-    """Raise `InputError` for a model or an option that the method does not know."""
+def _check_method(estimator: "MotionEstimator", kind: "type[Model]", options: Options) -> None:
+    """Raise `InputError` for a model or an option that the method does not support."""
     from jaxevent.methods import names
     from jaxevent.runs.egomotion import find_estimator
 
@@ -333,7 +339,7 @@ def _check(estimator: "MotionEstimator", kind: "type[Model]", options: Options) 
 def _crop_events(
     recording: "Recording", start: float | int | None, stop: float | int | None
 ) -> "Recording":
-    """Return a recording's events from start to stop (s), with the poses and the IMU of all."""
+    """Crop a recording's events to start..stop (s); poses and IMU stay whole."""
     if start is None and stop is None:
         return recording
     kept = {"poses": recording.poses, "imu": recording.imu}
@@ -345,8 +351,8 @@ def _crop_events(
     return part
 
 
-def _with_camera(recording: "Recording", focal: float | int | None) -> "Recording":
-    """Return the recording with a camera of the focal length (px) that was given, if any was."""
+def _with_focal_length(recording: "Recording", focal: float | int | None) -> "Recording":
+    """Give a recording a camera of the focal length (px); None leaves it as it is."""
     from jaxevent.camera import PinholeCamera
 
     if focal is None:
@@ -360,7 +366,7 @@ def _with_camera(recording: "Recording", focal: float | int | None) -> "Recordin
 
 
 def _truth_hint(recording: "Recording", kind: "type[Model]") -> list[str]:
-    """Return a line that recommends --truth if the recording holds its true motion, else none."""
+    """Return a line that recommends --truth if the recording holds its true motion."""
     has = {"poses": recording.poses, "gyro": recording.imu}
     sources = ("poses",) if kind.fits_depth and recording.camera is not None else kind.truth_sources
     known = [name for name in sources if (rows := has[name]) is not None and len(rows)]
@@ -368,12 +374,12 @@ def _truth_hint(recording: "Recording", kind: "type[Model]") -> list[str]:
 
 
 def _frames_hint(recording: "Recording", estimator: "MotionEstimator", values: Any) -> list[str]:
-    """Return a line that the recording's frames are not used, if there are any, else none.
+    """Return a line that says that the recording's frames, if any, are not used.
 
     Args:
         recording: The recording.
         estimator: The method.
-        values: Its parameters.
+        values: Parameters of the method.
 
     Returns:
         The line, or an empty list.
@@ -384,7 +390,7 @@ def _frames_hint(recording: "Recording", estimator: "MotionEstimator", values: A
     return [f"by the events alone, without the recording's {count}"]
 
 
-def _need_camera(recording: "Recording", kind: "type[Model]") -> None:
+def _require_camera(recording: "Recording", kind: "type[Model]") -> None:
     from jaxevent.egomotion import MODELS
 
     if kind.needs_camera and recording.camera is None:
@@ -396,10 +402,10 @@ def _need_camera(recording: "Recording", kind: "type[Model]") -> None:
         )
 
 
-def _parameters(
+def _load_params(
     estimator: "MotionEstimator", kind: "type[Model]", path: Path | None
 ) -> tuple[Any, set[str]]:
-    """Return the parameters, and the names of those that a file gives."""
+    """Return the parameters from a file or the defaults, and the names that the file sets."""
     from jaxevent.parameters import read_toml
 
     if path is None:
@@ -415,25 +421,25 @@ def estimate_or_fall_back(
     params: Path | None,
     settings: dict[str, Any],
     gyro: Any,
-    other: bool,
+    may_fall_back: bool,
 ) -> "tuple[MotionEstimator, MotionEstimate, Any]":
-    """Estimate the motion; try the model's other method if the first half has no estimate.
+    """Estimate the motion, by the model's fallback method if the first half has no estimate.
 
     Args:
         estimator: The method.
         recording: The recording.
         params: File of parameters, or None.
         settings: Options of `estimate`, with the model.
-        gyro: Whether the IMU helps, its bias and its axes.
-        other: Whether another method may be tried.
+        gyro: Whether the gyro is used, its bias (3,) in rad/s or None, and its rotation or None.
+        may_fall_back: Whether the fallback method may be tried.
 
     Returns:
-        The method, the motion by it, and its parameters, which suit the recording.
+        The method used, the motion, and the parameters, adapted to the recording.
     """
     from jaxevent.runs.egomotion import find_estimator
 
     kind = settings["model"]
-    values, given = _parameters(estimator, kind, params)
+    values, given = _load_params(estimator, kind, params)
     suited = estimator.adapt_params(recording, values, given=given)
     if suited.message:
         print(suited.message)
@@ -441,7 +447,7 @@ def estimate_or_fall_back(
     first, result = motion.t[motion.valid][:1], (estimator, motion, suited.params)
     is_early = len(first) and first[0] - recording.start <= (recording.stop - recording.start) / 2
     is_refuted = not len(first) and motion.warning
-    if is_early or is_refuted or not other or not kind.fallback_method:
+    if is_early or is_refuted or not may_fall_back or not kind.fallback_method:
         return result
     late = " before the recording's middle" if len(first) else ""
     print(f"{estimator.name} found no motion{late}, so {kind.fallback_method} is tried")
@@ -463,14 +469,14 @@ def _estimate(
     settings: dict[str, Any],
     gyro: Any,
 ) -> "MotionEstimate":
-    """Estimate the motion by a method.
+    """Estimate the motion by one method, with the gyro if it is used.
 
     Args:
         estimator: The method.
         recording: The recording.
         values: Parameters.
         settings: Options of `estimate`.
-        gyro: Whether the IMU helps, its bias (3,) in rad/s or None, and its axes.
+        gyro: Whether the gyro is used, its bias (3,) in rad/s or None, and its rotation or None.
 
     Returns:
         The motion.
@@ -478,33 +484,35 @@ def _estimate(
     from jaxevent.egomotion.estimator import InconsistentMotionWarning, LostMotionWarning
 
     more = {"cloud": N_PLOTTED_PARTICLES} if "cloud" in estimator.options else {}
-    helps, bias, turned = gyro
+    uses_gyro, bias, gyro_rotation = gyro
     with warnings.catch_warnings():
-        # The summary of the command shows them.
+        # The command's summary reports these.
         warnings.simplefilter("ignore", LostMotionWarning)
         warnings.simplefilter("ignore", InconsistentMotionWarning)
-        if helps:
-            more["gyro"] = _gyro(estimator, recording, values, settings, bias, turned)
+        if uses_gyro:
+            more["gyro"] = _gyro_without_bias(
+                estimator, recording, values, settings, bias, gyro_rotation
+            )
         return estimator.estimate(recording, values, **settings, **more)
 
 
-def _gyro(
+def _gyro_without_bias(
     estimator: "MotionEstimator",
     recording: "Recording",
     values: Any,
     settings: dict[str, Any],
     bias: "NDArray[np.float64] | None",
-    turned: "NDArray[np.float64] | None",
+    gyro_rotation: "NDArray[np.float64] | None",
 ) -> Any:
-    """Return the gyro's rates without bias.
+    """Return the gyro's rates without their bias.
 
     Args:
         estimator: The method of the first estimate.
         recording: The recording, with an IMU.
         values: Parameters.
         settings: Options of `estimate`.
-        bias: (3,) rad/s; None: by a first estimate.
-        turned: (3, 3) rotation from the gyro's axes to the camera's, or None.
+        bias: (3,) rad/s; None: fitted to a first estimate.
+        gyro_rotation: (3, 3) rotation from the gyro's axes to the camera's, or None.
 
     Returns:
         The measured rates, less the bias.
@@ -516,7 +524,7 @@ def _gyro(
 
     assert recording.imu is not None  # see `_open`
     zero = np.zeros(3) if bias is None else bias
-    measured = from_gyro(recording.imu, zero, turned)
+    measured = from_gyro(recording.imu, zero, gyro_rotation)
     if bias is not None:
         return measured
     motion = estimator.estimate(recording, values, **settings)

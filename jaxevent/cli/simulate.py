@@ -140,33 +140,31 @@ def run(
     of_video = {"start": start, "cut": cut, "max-size": max_size}
     if blobs is not None:
         own = {"sensor": sensor, "speed": speed, "size": size, "change": change}
-        _refuse("is not for blobs; leave it out", **of_video, **own)
+        _refuse_options("is not for blobs; leave it out", **of_video, **own)
         return _simulate_blobs(blobs, truth, out, seed, duration)
     if motion is not None:
-        _refuse("is not for the motion of a camera; leave it out", **of_video)
+        _refuse_options("is not for the motion of a camera; leave it out", **of_video)
         how = {"change": change or "constant", "sensor": sensor, "speed": speed}
         return _simulate_motion(
             motion, truth, out, seed, duration or 0.5, size or (240, 180), **how
         )
     what = "that of --blobs and --motion; HDR scenes hold theirs, leave it out"
-    _refuse(f"is {what}", truth=truth)
-    _refuse("is for --motion; leave it out", change=change)
+    _refuse_options(f"is {what}", truth=truth)
+    _refuse_options("is for --motion; leave it out", change=change)
     chosen = SENSORS[sensor or "davis"]
     if video is not None:
-        _refuse("is for a scene or --objects; scale a video with --max-size", size=size)
+        _refuse_options("is for a scene or --objects; scale a video with --max-size", size=size)
         given = {name.replace("-", "_"): v for name, v in of_video.items() if v is not None}
         return _simulate_video(
             video, out, sensor=chosen, seed=seed, speed=speed, duration=duration, given=given
         )
     what = "--objects" if objects else "--scene"
-    _refuse(f"is for a video; leave it out with {what}", **of_video)
-    _simulate_frames(
-        scene, out, sensor=chosen, seed=seed, speed=speed, duration=duration, size=size
-    )
+    _refuse_options(f"is for a video; leave it out with {what}", **of_video)
+    _simulate_scene(scene, out, sensor=chosen, seed=seed, speed=speed, duration=duration, size=size)
 
 
-def _refuse(why: str, **given: Any) -> None:
-    """Raise `InputError` for the first of the options that was given."""
+def _refuse_options(why: str, **given: Any) -> None:
+    """Raise `InputError` if any of these options is given."""
     for name, value in given.items():
         if value is not None:
             raise InputError(f"--{name} {why}")
@@ -200,7 +198,7 @@ def _simulate_video(
     print_stored(recording, out)
 
 
-def _simulate_frames(
+def _simulate_scene(
     scene: str | None,
     out: Path,
     *,
@@ -210,7 +208,7 @@ def _simulate_frames(
     duration: float | int | None,
     size: tuple[int, int] | None,
 ) -> None:
-    """Simulate a camera over a scene; without a scene, moving objects.
+    """Simulate a camera that pans over a scene; without a scene, moving objects.
 
     Args:
         scene: Number or name of a scene; None: moving objects.
@@ -228,7 +226,7 @@ def _simulate_frames(
 
     with complete(out) as partial:
         if scene is None:
-            pace = _pace(speed, "200") or 90.0
+            pace = _parse_speed(speed, "200") or 90.0
             source = sim.MovingObjects(size or (160, 120), duration or 1.0, pace, seed=seed)
             name = "objects"
         else:
@@ -266,8 +264,8 @@ def _simulate_blobs(
     print_stored(recording, out)
 
 
-def _pace(speed: str | None, example: str) -> float | None:
-    """Return the number that --speed gives; raise `InputError` unless it is above 0."""
+def _parse_speed(speed: str | None, example: str) -> float | None:
+    """Convert --speed to a number; raise `InputError` unless it is above 0."""
     try:
         pace = None if speed is None else float(speed)
     except ValueError:
@@ -296,10 +294,10 @@ def _simulate_motion(
     from jaxevent.egomotion.models import MODELS, General
     from jaxevent.io import save
     from jaxevent.io.output import complete
-    from jaxevent.show.motion import write_known
+    from jaxevent.show.motion import write_known_motion
     from jaxevent.simulate import SENSORS, motion_scene
 
-    pace = _pace(speed, "1.5")
+    pace = _parse_speed(speed, "1.5")
     with contextlib.ExitStack() as stack:
         partial = stack.enter_context(complete(out))
         table = None if truth is None else stack.enter_context(complete(truth))
@@ -311,7 +309,7 @@ def _simulate_motion(
         save(recording, partial)
         if table is not None:
             times = np.arange(0, round(1e6 * duration) + 1, 1000)
-            # Scenes of a name that is no model's move in general.
+            # Scenes that are not named after a model have general motion.
             model = MODELS.get(name, General)
-            write_known(table, model, times, model.from_scene(source, times))
+            write_known_motion(table, model, times, model.from_scene(source, times))
     print_stored(recording, out)

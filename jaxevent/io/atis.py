@@ -1,26 +1,24 @@
 """Recordings of the ATIS: Event Stream (.es, version 2), and .bin of N-Caltech101 and N-MNIST.
 
-Event Stream also holds change events of a DVS. After a header with the sensor's size each event is
-5 bytes, one of time since the event before and polarity, then x and y; single bytes carry longer
-times. The clock starts at 0 with the recording. The rows of the format count from the bottom: y
-becomes height - 1 - y here.
+Event Stream also holds change events of a DVS. After a header with the sensor's size each event has
+5 bytes: one with the polarity and the time since the previous event, then x and y. Longer times
+need further single bytes. The clock starts at 0 with the recording. The format counts rows from the
+bottom, so y becomes height - 1 - y.
 
-An ATIS sends two kinds of event. Its change events are the events of the recording. The others,
-crossings of two thresholds whose distance in time measures the absolute intensity of a pixel, are
-no change and are not kept; `extra["intensity_events"]` is their number.
+An ATIS sends two kinds of event. Its change events are the events of the recording. The others are
+crossings of two thresholds, whose distance in time measures the absolute intensity of a pixel. They
+are not kept; `extra["intensity_events"]` is their number.
 
-Files of N-Caltech101 and N-MNIST have no header. Every event is 5 bytes, big-endian: 8 bits of x, 8
-of y from the top, one of polarity, 23 of the time in us. A row of 240, which the sensor lacks, is
-no event: the counter of time has overflowed, and all later times are 2^13 us later. The file does
-not state the sensor's size, which must be given; a file whose times go back is not taken for this
-format.
+Files of N-Caltech101 and N-MNIST have no header. Every event has 5 bytes, big-endian: 8 bits of x,
+8 of y from the top, one of polarity, 23 of the time in us. A row of 240, which the sensor lacks,
+marks an overflow of the time counter: all later times are 2^13 us later. The file does not state
+the sensor's size, which must be given. A file whose times go back is not taken for this format.
 
-Decoders. Event Stream has no fixed records, so it is decoded here by a numba loop: 220 million
-events/s. The package event_stream (C++; its files name two licences, MIT and GPL 3) decodes
-atis.es to the same 1,326,017 events, and the same short files of every byte; it stops without a
-word where a file ends inside an event. The .bin files have records of one length, decoded here by
-NumPy, by the published reader of the data sets (Orchard et al. 2015); checked against files written
-by the layout.
+Decoders. Event Stream has no fixed records, so a numba loop decodes it: 220 million events/s. The
+package event_stream (C++; its files name two licences, MIT and GPL 3) decodes atis.es to the same
+1,326,017 events, and agrees on short files of every byte; it stops without a message if a file ends
+inside an event. The .bin files have records of one length, which NumPy decodes as the published
+reader of the data sets does (Orchard et al. 2015); this was checked on files written by the layout.
 """
 
 import functools
@@ -37,19 +35,19 @@ from jaxevent.io.checks import ReadOptions, check_whole_records, reading, sensor
 from jaxevent.io.decoded import Columns, FirstPass, read_events
 from jaxevent.recording import Recording
 
-_HEADER_BYTES = 20  # bytes
+_HEADER_BYTES = 20  # of Event Stream
 _DATA_KINDS = {0: "generic data", 1: "DVS events", 2: "ATIS events", 4: "colour events"}
 _OVERFLOW_ROW, _OVERFLOW_US = 240, 1 << 13
-_MIN_EVENTS = 16  # by which a file without a header is recognised
+_MIN_RECOGNISED_EVENTS = 16  # least events of a file without a header that is recognised
 
 
 def is_n_caltech(path: Path) -> bool:
-    """Return whether a file without a header can be a .bin: its first times never go back."""
+    """Return whether a file without header can be such a .bin: its first times never go back."""
     length = path.stat().st_size
-    if length % 5 or length < 5 * _MIN_EVENTS:
+    if length % 5 or length < 5 * _MIN_RECOGNISED_EVENTS:
         return False
     _, (t, _, _, _) = next(_decode_bin(path, None))
-    return len(t) >= _MIN_EVENTS and bool((t[1:] >= t[:-1]).all())
+    return len(t) >= _MIN_RECOGNISED_EVENTS and bool((t[1:] >= t[:-1]).all())
 
 
 def read_n_caltech(path: Path, options: ReadOptions) -> Recording:
@@ -147,15 +145,16 @@ def _decode_stream(data, t, is_atis):
     """Decode whole events at the start of some bytes.
 
     A first byte dddddddp holds time d and polarity p for a DVS, ddddddpc for an ATIS with c set for
-    a crossing. All of d set: the time goes on by 127 p (DVS), or 63 times the two low bits (ATIS).
+    a crossing. If all bits of d are set, the byte only adds time: 127 p for a DVS, 63 times the two
+    low bits for an ATIS.
 
     Args:
         data: (bytes,) uint8.
-        t: Time at their start, us.
-        is_atis: Whether the stream is an ATIS's.
+        t: Time before the first event, us.
+        is_atis: Whether the stream comes from an ATIS.
 
     Returns:
-        The columns, the numbers of events, crossings and bytes used, and the time after them.
+        The columns, the numbers of events, crossings and bytes used, and the time at their end.
     """
     most = len(data) // 5
     ts, xs = np.empty(most, np.int64), np.empty(most, np.int32)

@@ -1,4 +1,4 @@
-"""MATLAB files, v5 and v7.3: the layout of the asynchronous Kalman filter and HDR recordings:
+"""MATLAB files, v5 and v7.3, in the layout of the AKF's recordings and their HDR references:
 
     events      (N, 4)     t (us), x, y, p; x and y count from 1, p is 0/1 or -1/1; or (4, N)
     image       (H, W, K)  uint8, uint16 or floats in [0, 1]
@@ -51,10 +51,11 @@ from jaxevent.io.columns import (
 from jaxevent.recording import Events, Frames, Recording
 from jaxevent.time_units import SAMPLE_EVENTS, Clock
 
-_MATRIX, _COMPRESSED = 14, 15  # types of elements
-_FLAGS, _SIZES, _NAME = 6, 5, 1
+# Types of elements of a v5 file.
+_MATRIX, _COMPRESSED = 14, 15
+_FLAGS, _SIZES, _NAME = 6, 5, 1  # types of the first three elements of a variable
 _NUMBER_KINDS = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13}
-_ARRAY_CLASSES = range(6, 16)  # of arrays: double, single and the integers
+_ARRAY_CLASSES = range(6, 16)  # classes of numeric arrays: double, single and the integers
 _KNOWN_VARIABLES = ("image", "time_image", "exposure", "f_Q", "ct", "HDR_mat")  # but events
 _STRUCT_CLASS = 2  # class of a struct
 
@@ -75,17 +76,17 @@ def read_v5(path: Path, options: ReadOptions) -> Recording:
     import scipy.io
 
     with reading(path):
-        variables = scipy.io.loadmat(_decompress(path))
+        variables = scipy.io.loadmat(_copy_numeric_variables(path))
     return _make_recording(
         path, options, {name: v for name, v in variables.items() if not name.startswith("__")}
     )
 
 
-def _decompress(path: Path) -> BytesIO:
-    """Copy the numeric variables of a file, without compression and checked to be whole.
+def _copy_numeric_variables(path: Path) -> BytesIO:
+    """Copy the numeric variables of a file, uncompressed and checked to be complete.
 
-    SciPy takes the number of a type as an index into its table without looking, and reads on past
-    the end of a variable: a damaged file ends the process.
+    SciPy uses the number of a type as an index without a check, and reads past the end of a
+    variable, so a damaged file would crash the process.
     """
     data = path.read_bytes()
     order = "<" if data[126:128] == b"IM" else ">"
@@ -114,11 +115,11 @@ def _decompress(path: Path) -> BytesIO:
 
 
 class _Element(NamedTuple):
-    """One element of a variable.
+    """Element of a variable in a v5 file.
 
     Attributes:
-        kind: Its type.
-        data: Its bytes.
+        kind: Number of the element's type.
+        data: Bytes of the element.
         stop: Offset of the next element.
     """
 
@@ -145,13 +146,13 @@ def _elements(body: memoryview, order: str, wrong: InputError) -> Iterator[_Elem
 def _numeric_parts(
     body: memoryview, order: str, wrong: InputError, *, is_field: bool = False
 ) -> list[bytes]:
-    """Return the arrays of numbers in a variable: itself, or the fields of a lone struct.
+    """Return the numeric arrays in a variable: the variable itself, or the fields of a struct.
 
-    They are the flags, whose lowest byte is the class and whose bit 11 marks complex, the sizes,
-    the name, the real and for complex the imaginary numbers; of a struct, in place of numbers, the
-    length of its fields' names, these, and the fields. Fields become variables of their own, named
-    "struct.field"; structs that are fields themselves are left out. Raises `wrong` if the elements
-    do not fill the variable.
+    The elements of an array are its flags, sizes, name, real numbers and, if it is complex,
+    imaginary numbers. The lowest byte of the flags is the class; bit 11 marks a complex array. A
+    struct has, in place of numbers, the length of its fields' names, the names, and the fields. Its
+    fields become variables named "struct.field"; nested structs and arrays of structs are left out.
+    Raises `wrong` if the elements do not fill the variable.
     """
     elements = _elements(body, order, wrong)
     flags = next(elements, None)
@@ -264,9 +265,9 @@ def _make_recording(path: Path, options: ReadOptions, variables: dict) -> Record
 
 
 class _StoredEvents(NamedTuple):
-    """Events as stored: columns by name, or in one array whose order may be known.
+    """Events as stored: columns by name, or one array whose order of columns may be known.
 
-    `is_layout` marks the array of the layout: t x y p, where times are sorted so.
+    `is_layout` marks the array `events` of the layout: t x y p, if its times are sorted.
     """
 
     columns: dict[str, NDArray]
@@ -276,7 +277,7 @@ class _StoredEvents(NamedTuple):
 
 
 def _find_events(arrays: dict[str, NDArray]) -> _StoredEvents | None:
-    """Take the events out of the variables; None where there are none."""
+    """Remove the events from the variables and return them; None if there are none."""
     if "events" in arrays:
         return _StoredEvents({}, arrays.pop("events"), is_layout=True)
     structs = sorted({name.partition(".")[0] for name in arrays if "." in name})
@@ -315,7 +316,7 @@ def _read_events(
             with contextlib.suppress(InputError):  # the first bad value is named
                 order = order_of(rows[:SAMPLE_EVENTS], (size[0] + 1, size[1] + 1), source)
         columns = split_rows(rows, order)
-    # MATLAB counts from 1, and programs that write its files from 0.
+    # MATLAB counts from 1; other programs that write its files count from 0.
     is_from_0 = not found.is_layout and any((columns[name] == 0).any() for name in "xy")
     events = read_whole_columns(
         columns,
@@ -337,7 +338,7 @@ def _has_order_of_layout(rows: NDArray) -> bool:
 
 
 def _vector(value: NDArray) -> NDArray:
-    """Turn MATLAB's row or column (1 x N) into a vector."""
+    """Flatten a MATLAB row or column (1 x N) to a vector."""
     return value.reshape(-1) if value.size == max(value.shape, default=0) else value
 
 
@@ -349,10 +350,10 @@ def _check_images(path: Path, images: NDArray) -> NDArray | None:
         images: [y, x] or [y, x, frame].
 
     Returns:
-        [frame, y, x]; None of no images.
+        [frame, y, x]; None if the array is empty.
 
     Raises:
-        InputError: Floats exceed 1, or the shape is another.
+        InputError: Floats exceed 1, or the array has another shape.
     """
     if images.size == 0:
         return None
@@ -394,7 +395,7 @@ def _frames_first(images: NDArray, source: str) -> NDArray:
         Contiguous [frame, y, x], or [y, x].
 
     Raises:
-        InputError: It has other dimensions.
+        InputError: The array has other dimensions.
     """
     if images.ndim not in (2, 3):
         raise InputError(f"{source} has shape {images.shape}; store grey images as H x W x K")
@@ -406,14 +407,14 @@ def _to_grey_reference(images: NDArray, frames: int, source: str) -> NDArray:
 
     Args:
         images: [y, x[, frame]] or in colour [y, x, 3[, frame]].
-        frames: Number of frames; of 3, three images are not taken for colours.
+        frames: Number of frames; if it is 3, an axis of length 3 is that of frames, not colours.
         source: Name of the array, for messages.
 
     Returns:
         [frame, y, x] or [y, x].
 
     Raises:
-        InputError: It has another shape.
+        InputError: The array has another shape.
     """
     colour = images.ndim == 4 or (images.ndim == 3 and images.shape[2] == 3 and frames != 3)
     if colour and images.shape[2] != 3:

@@ -1,4 +1,4 @@
-"""Refinement of a registration, to a fraction of a pixel and a millisecond, by images of change."""
+"""Refinement of a registration to a fraction of a pixel and a millisecond, by images of change."""
 
 import contextlib
 import dataclasses
@@ -26,11 +26,11 @@ from jaxevent.register.geometry import (
     undistorted_pixels,
 )
 
-_SMOOTHINGS_PX = (4.0, 2.0, 1.2)  # px of the event camera by which changes are smoothed, in turn
-_MAX_STEPS = 12  # Gauss-Newton steps of a smoothing at most
+_SMOOTHINGS_PX = (4.0, 2.0, 1.2)  # smoothings of changes, one after another, px of the event camera
+_MAX_STEPS = 12  # most Gauss-Newton steps at each smoothing
 _N_FRAME_PAIRS = 32  # pairs of frames that are compared
-_MAX_PAIR_PIXELS = 40_000  # of a pair that are compared
-_MIN_KNOWN_WEIGHT = 0.75  # weight of unclipped pixels in a smoothed change that counts
+_MAX_PAIR_PIXELS = 40_000  # most pixels of a pair that are compared
+_MIN_UNCLIPPED_WEIGHT = 0.75  # least weight of unclipped pixels in a smoothed change that counts
 MIN_AGREEMENT = 0.25  # correlation of changes below which a registration is refused
 
 
@@ -51,37 +51,37 @@ def refine(
         D(W(x; h)) = a ON(x; o) - b OFF(x; o) + const,
 
     ON and OFF being the numbers of events from one mid-exposure to the other. h, o and the
-    thresholds a, b minimise the sum of squares over pixels and 32 pairs of frames, under Huber's
-    weights, by Gauss-Newton steps from coarse to fine (smoothed by 4, 2 and 1.2 px): alignment as
-    that of Evangelidis and Psarakis, PAMI 2008, but of images of change. Both cameras measure these
-    alike, so the lag of a reconstruction has no part in it. Clipped pixels do not count. The
-    homography is moved by the positions of the image's corners.
+    thresholds a, b minimise the sum of squares over pixels and 32 pairs of frames, with Huber's
+    weights, by Gauss-Newton steps from coarse to fine (smoothed by 4, 2 and 1.2 px). This is the
+    alignment of Evangelidis and Psarakis (PAMI 2008), applied to images of change. Both cameras
+    measure changes alike, so no reconstruction, which would lag, is needed. Clipped pixels do not
+    count. The homography is parameterised by the positions of the image's corners.
 
     Args:
         recording: Events of the event camera.
         other: Frames of the other camera.
-        offset: Offset of the clocks to begin with, s, right to half a frame.
+        offset: Initial offset of the clocks, s, correct to half a frame.
         grid: Grid (height, width, 2) of a calibrated rig, which is kept.
-        homographies: Homographies (3, 3) to begin with, right to about 5 px; the one with which
-            changes agree best is refined.
+        homographies: Initial homographies (3, 3), correct to about 5 px; the one whose changes
+            agree best is refined.
         keep_offset: Whether the offset is kept.
 
     Returns:
         The refined registration.
 
     Raises:
-        InputError: Frames and events share nothing to compare.
+        InputError: Frames and events share no changes to compare.
     """
     if (grid is None) == (not homographies):
         raise InputError("give either a grid or homographies to start from")
     starts = [None] if grid is not None else [check_homography(one) for one in homographies or ()]
     tries = []
     for H in starts:
-        problem = _Alignment(recording, other, grid, H, keep_offset)
+        problem = _AlignmentProblem(recording, other, grid, H, keep_offset)
         at = np.append(problem.corners, float(offset))
         with contextlib.suppress(InputError):
             problem.choose_pairs(float(offset))
-            tries.append((problem.fit(at, _SMOOTHINGS_PX[0]).agreement, H, problem, at))
+            tries.append((problem.fit_thresholds(at, _SMOOTHINGS_PX[0]).agreement, H, problem, at))
     if not tries:
         raise InputError(
             f"{other.name}: with the offset {offset:g} s its frames show too little, unclipped, of "
@@ -89,8 +89,8 @@ def refine(
         )
     agreement, H, problem, at = max(tries, key=lambda one: one[0])
     for sigma in _SMOOTHINGS_PX:
-        at, agreement = problem.solve(at, sigma)
-        if agreement < MIN_AGREEMENT / 2:  # hopeless; those that are right begin above a half
+        at, agreement = problem.run_gauss_newton(at, sigma)
+        if agreement < MIN_AGREEMENT / 2:  # correct registrations begin above 0.5
             break
     if H is not None:
         H = problem.homography(at)
@@ -101,15 +101,15 @@ def refine(
 
 @dataclasses.dataclass(frozen=True)
 class _Fit:
-    """Linear model of the changes of all pairs, and its fit.
+    """Linear model of the changes of all pairs of frames, fitted to events.
 
     Attributes:
-        X: (values, 3) ON and OFF events, and 1.
+        X: (values, 3) ON events, OFF events, and 1.
         D: (values,) changes of log intensity.
         slope: (values, 2) derivative of `D` per px of the other camera.
-        use: (pairs, n) whether a value of a pair is used.
-        weight: (values,) weights.
-        b: (3,) coefficients.
+        use: (pairs, n) whether a pixel of a pair is used.
+        weight: (values,) robust weights.
+        b: (3,) coefficients of `X`.
         agreement: Correlation of the fit with the changes.
     """
 
@@ -122,8 +122,8 @@ class _Fit:
     agreement: float
 
 
-class _Alignment:
-    """Changes between pairs of frames, of the frames and of the events; see `refine`."""
+class _AlignmentProblem:
+    """Least-squares problem of `refine`: changes between frames, by frames and by events."""
 
     def __init__(
         self,
@@ -160,7 +160,7 @@ class _Alignment:
         return np.append(np.linalg.solve(np.array(rows), values), 1.0).reshape(3, 3)
 
     def positions(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the positions (n, 2), px, that the compared pixels see, NaN outside."""
+        """Return the positions (n, 2), px, in the other camera of compared pixels; NaN outside."""
         s = self.stride
         if self.fixed is not None:
             return self.fixed[s // 2 :: s, s // 2 :: s].reshape(-1, 2)
@@ -169,7 +169,7 @@ class _Alignment:
         return mask_outside(seen, (self.other.width, self.other.height))
 
     def choose_pairs(self, offset: float) -> None:
-        """Choose the pairs of frames with the most events, with about an event per pixel each."""
+        """Choose pairs of frames with many events between them, about one event per pixel."""
         t = self.frames.t + round(offset * 1e6)
         begin, end = self.recording.event_span()
         inside = np.flatnonzero((t >= begin) & (t <= end))
@@ -182,7 +182,7 @@ class _Alignment:
         each = max((index[-1] - index[0]) / (len(index) - 1), 1) / (self.size[0] * self.size[1])
         apart = int(np.clip(round(1 / each), 1, max(1, (len(inside) - 1) // 4)))
         first = np.arange(0, len(inside) - apart, max(1, apart // 2))
-        # Those that show something, of all times: translation is an offset if motion is the same.
+        # Spread over all times: under constant motion a translation cannot be told from an offset.
         clear = np.array([self._unclipped_share(int(k)) for k in inside])
         worth = (index[first + apart] - index[first]) * np.minimum(
             clear[first], clear[first + apart]
@@ -201,10 +201,10 @@ class _Alignment:
     def event_changes(self, offset: float, sigma: float) -> NDArray[np.float64]:
         """Return smoothed numbers of ON and OFF events of each pair.
 
-        An event shows that a threshold has been crossed since the pixel's last one, so counts lag
-        behind intensity by half a threshold, in slow scenes by tens of ms. Each event therefore
-        counts evenly over the time since the one before it, or until the one after it if that is
-        shorter, if both are of its polarity.
+        An event shows that a threshold has been crossed since the pixel's last event, so counts lag
+        behind intensity by half a threshold, in slow scenes by tens of ms. Each event is therefore
+        spread evenly over the interval from the pixel's previous event of the same polarity to it;
+        this interval is cut to the length of the one after it if that is shorter.
 
         Args:
             offset: Offset of the clocks, s.
@@ -227,7 +227,7 @@ class _Alignment:
         return np.stack(out).astype(np.float64)
 
     def _event_intervals(self, offset: float) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return place and polarity of each pair's events, and begin and end (us) of each."""
+        """Return, for each pair, the events' index of polarity and pixel, begin and end (us)."""
         if self._near is None or abs(offset - self._near[0]) * 1e6 > self.apart / 2:
             width, height = self.size
             found = []
@@ -241,21 +241,21 @@ class _Alignment:
                 same = (pixel[1:] == pixel[:-1]) & (p[1:] == p[:-1])
                 gap = np.where(same, np.diff(t), np.inf)
                 since = np.minimum(np.append(np.inf, gap), np.append(gap, np.inf))
-                # Alone: no more than its polarity is known.
+                # An isolated event has no interval: 1 us.
                 since = np.maximum(np.where(np.isfinite(since), since, 1), 1)
                 found.append((p * (height * width) + pixel, t - since, t))
             self._near = offset, found
         return self._near[1]
 
     def frame_changes(self, at: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
-        """Return the changes of frames at the compared pixels.
+        """Return the smoothed changes of frames at the compared pixels.
 
         Args:
             at: Corners' positions (8,), if a homography is fitted, and the offset.
             sigma: Smoothing, px of the event camera.
 
         Returns:
-            (pairs, n, 4): D, its gradient by x and y, and its weight.
+            (pairs, n, 4): D, its gradient along x and y, and its weight.
         """
         where = self.positions(at)
         part = self.pixels[self.stride // 2 :: self.stride, self.stride // 2 :: self.stride]
@@ -275,7 +275,7 @@ class _Alignment:
             scale: Pixels of the other camera per pixel of the event camera.
 
         Returns:
-            (other pixels, pairs * 4): D, its gradient by x and y, and 1 where it is known.
+            (other pixels, pairs * 4): D, its gradient along x and y, and 1 where it is known.
         """
         blur = sigma * scale
         if self._images[0] is None or abs(math.log(self._images[0] / blur)) > 0.1:
@@ -286,13 +286,15 @@ class _Alignment:
                 change = (high - low).astype(np.float32) * good
                 weight = ndimage.gaussian_filter(good, blur)
                 D = ndimage.gaussian_filter(change, blur) / np.maximum(weight, 0.1)
-                known = (weight > _MIN_KNOWN_WEIGHT).astype(np.float32)
+                known = (weight > _MIN_UNCLIPPED_WEIGHT).astype(np.float32)
                 images += [D, np.gradient(D, axis=1), np.gradient(D, axis=0), known]
             self._images = blur, np.stack([one.ravel() for one in images], 1).astype(np.float64)
         return self._images[1]
 
-    def solve(self, at: NDArray[np.float64], sigma: float) -> tuple[NDArray[np.float64], float]:
-        """Take Gauss-Newton steps until they are small.
+    def run_gauss_newton(
+        self, at: NDArray[np.float64], sigma: float
+    ) -> tuple[NDArray[np.float64], float]:
+        """Take Gauss-Newton steps at one smoothing until they are small.
 
         Args:
             at: Corners' positions (8,), if a homography is fitted, and the offset.
@@ -303,11 +305,11 @@ class _Alignment:
         """
         self.choose_pairs(float(at[-1]))
         self.stride = max(self.finest, int(sigma / 1.3))  # neighbours in smooth images are alike
-        fit = self.fit(at, sigma)
+        fit = self.fit_thresholds(at, sigma)
         for _ in range(_MAX_STEPS):
-            step, moved = self.step(at, sigma, fit), None
+            step, moved = self.gauss_newton_step(at, sigma, fit), None
             for _ in range(4):
-                now = self.fit(at + step, sigma)
+                now = self.fit_thresholds(at + step, sigma)
                 if now.agreement > fit.agreement:
                     moved = at + step
                     break
@@ -319,8 +321,8 @@ class _Alignment:
                 break
         return at, fit.agreement
 
-    def fit(self, at: NDArray[np.float64], sigma: float) -> _Fit:
-        """Fit the thresholds at given unknowns, and correlate changes under Huber's weights.
+    def fit_thresholds(self, at: NDArray[np.float64], sigma: float) -> _Fit:
+        """Fit the thresholds with all other unknowns fixed, and correlate the changes.
 
         Args:
             at: Corners' positions (8,), if a homography is fitted, and the offset.
@@ -350,14 +352,16 @@ class _Alignment:
         agreement = _correlate_weighted(D, X @ b, weight)
         return _Fit(X, D, np.stack([slope_x[use], slope_y[use]], -1), use, weight, b, agreement)
 
-    def step(self, at: NDArray[np.float64], sigma: float, fit: _Fit) -> NDArray[np.float64]:
-        """Return the Gauss-Newton step from given unknowns, limited by the smoothing.
+    def gauss_newton_step(
+        self, at: NDArray[np.float64], sigma: float, fit: _Fit
+    ) -> NDArray[np.float64]:
+        """Return the Gauss-Newton step at given unknowns, limited to a multiple of the smoothing.
 
         D + D' dh = X(o) b + (X' b) do + X db is linear in dh, do and b + db.
 
         Args:
             at: Corners' positions (8,), if a homography is fitted, and the offset.
-            sigma: Smoothing, px.
+            sigma: Smoothing, px of the event camera.
             fit: Fit at these unknowns.
 
         Returns:
@@ -411,7 +415,7 @@ def _interpolation_matrix(at: NDArray[np.float64], shape: tuple[int, int]) -> An
 def _least_squares(
     A: NDArray[np.float64], y: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Solve weighted least squares; columns that are 0 or copies of others get 0.
+    """Solve weighted least squares; of dependent columns the solution of least norm is taken.
 
     Args:
         A: (n, d) rows.

@@ -1,4 +1,4 @@
-"""Tracks compared with known targets, for `jaxevent evaluate`.
+"""Scores of tracks against known targets, for `jaxevent evaluate`.
 
 Settings beside `protocol = "tracks"`:
 
@@ -8,30 +8,30 @@ Settings beside `protocol = "tracks"`:
                                         # does; "born": they are born where events are many
     seeds = [[30.0, 40.0, 8.0]]         # x, y, size in px (and s) of each target, in place of those
                                         # of the positions
-    smooth = true                       # states rest on all events, where the method can; false: on
-                                        # those up to each time
-    reach = 10.0                        # px up to which a track may be a target
-    pairs = [[0, 1]]                    # ids of targets at one depth, which tell time to contact
-    extent = 0.24                       # m, of the targets; with `focal` it tells their range
+    smooth = true                       # states use all events, if the method can; false: only
+                                        # events up to each time
+    reach = 10.0                        # px, largest distance of a track from its target
+    pairs = [[0, 1]]                    # ids of targets at one depth, for time to contact
+    extent = 0.24                       # m, of the targets; with `focal` it gives their range
     focal = 1000.0                      # px
-    metrics = ["mypackage.mymodule:function"]  # of one's own: `jaxevent.runs.own`
+    metrics = ["mypackage.mymodule:function"]  # your own, see `jaxevent.runs.own`
     size_factor = 0.25                  # lambda over the diameter in the image; omitted: 0.354
 
-With "found", numbers of `params` that are not the defaults win over what is found.
+With "found", numbers of `params` that differ from the defaults replace those that are found.
 
-Positions are a table with the columns t (s), x, y (px) and, of more than one target, id, as
-`jaxevent track` and `jaxevent simulate --truth` write them. The columns vx, vy (px/s), lambda1,
-lambda2 (px), theta (rad), inverse_ttc (1/s) and range (m) may be added, empty where nothing is
-known; further ones are left out. Targets by rising id are those of the seeds in their order.
+Positions are a table with the columns t (s), x, y (px) and, if there are several targets, id, as
+`jaxevent track` and `jaxevent simulate --truth` write it. The columns vx, vy (px/s), lambda1,
+lambda2 (px), theta (rad), inverse_ttc (1/s) and range (m) are optional, and empty where unknown;
+further columns are ignored. Targets in the order of their ids correspond to the seeds in theirs.
 
-A row has `rmse` and `median`, of the distances from the positions (px), and `covered`, the share of
-the positions at which a track was there: the target's own where tracks begin at the positions, else
-the one that is taken for it. Then, as `jaxevent.blob.scores` says, `tracks`, `missed`, `false`,
-`switches`, `mota`, `idf1` and `hota`. Of the track that is taken for each target, where the truth
-is known: `velocity` (px/s), root of the mean square of the difference's length; `size`, that of ln
-lambda1 and ln lambda2; `theta` (degrees), where lambda1 is larger than 1.15 lambda2; `inverse_ttc`
-(1/s), of pairs, of other targets of their growth; `range`, that of the ratio to the truth less 1.
-`per_time` lists t (us) and `distance`, of all targets one after another; None where no track was.
+A row has `rmse` and `median` of the distances from the positions (px), and `covered`, the share of
+the positions with a track: the target's own track if tracks begin at the positions, else the track
+matched to it. `tracks`, `missed`, `false`, `switches`, `mota`, `idf1` and `hota` are described in
+`jaxevent.blob.scores`. For the track of each target, where the truth is known, there are root mean
+square errors: `velocity` (px/s), of the vector; `size`, of ln lambda1 and ln lambda2; `theta`
+(degrees), where lambda1 exceeds 1.15 lambda2; `inverse_ttc` (1/s), by pairs, and by growth for
+other targets; `range`, relative. `per_time` lists t (us) and `distance` of all targets one after
+another; None where there was no track.
 """
 
 import dataclasses
@@ -84,7 +84,7 @@ TARGET_SETTINGS: Mapping[str, Check] = {
 }
 
 
-# Columns beside x, y.
+# Columns of true quantities beside x, y.
 OPTIONAL_COLUMNS = ("vx", "vy", "lambda1", "lambda2", "theta", "inverse_ttc", "range")
 
 
@@ -95,8 +95,8 @@ class KnownPositions:
     Attributes:
         t: (T,) times, us.
         xi: (T, targets, 2) positions, px, NaN where unknown.
-        more: Further columns, of `OPTIONAL_COLUMNS`, (T, targets) each.
-        id: (targets,) numbers of the targets.
+        more: Columns of `OPTIONAL_COLUMNS` that are given, (T, targets) each.
+        id: (targets,) ids of the targets.
     """
 
     t: NDArray[np.int64]
@@ -106,7 +106,7 @@ class KnownPositions:
 
 
 def read_positions(path: str | Path) -> KnownPositions:
-    """Read positions from a table in a file; see the text of this module.
+    """Read positions from the file of a table, which the text of this module describes.
 
     Raises `InputError` for a file that cannot be read and for missing columns or numbers.
     """
@@ -162,26 +162,26 @@ def positions_of(
 
 @dataclasses.dataclass(frozen=True)
 class Targets:
-    """Targets of a configuration: seeds, and the name of tables of positions."""
+    """Targets of a configuration: seeds, and tables of positions or the name of their files."""
 
     seeds: tuple[tuple[float, ...], ...] | None
     positions: str | TruthTables | None
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> "Targets":
-        """Make them from settings of a configuration, those named in `TARGET_SETTINGS`."""
+        """Make targets from the settings of a configuration that `TARGET_SETTINGS` names."""
         seeds = given.get("seeds")
         seeds = None if seeds is None else tuple(tuple(map(float, seed)) for seed in seeds)
         return cls(seeds, given.get("positions"))
 
     def files(self, recording: Path) -> list[Path]:
-        """Return the tables beside a recording."""
+        """Return the files of positions that belong to a recording."""
         if self.positions is None:
             return []
         return truth_files(self.positions, str(recording))
 
     def known(self, recording: Recording) -> KnownPositions | None:
-        """Return the positions of a recording within the time of its events."""
+        """Return the known positions in a recording within the time span of its events."""
         if self.positions is None:
             return None
         table = truth_table(self.positions, recording.name)
@@ -207,7 +207,7 @@ class Targets:
         return KnownPositions(known.t[inside], known.xi[inside], more, known.id)
 
     def first_seeds(self, known: KnownPositions | None, params: TrackerParams) -> list[Any] | None:
-        """Return the seeds of a whole recording; None if tracks are born."""
+        """Return one seed per target, at its first known position; None if nothing is known."""
         if self.seeds is not None:
             return [tuple(seed) for seed in self.seeds]
         if known is None:
@@ -223,9 +223,9 @@ class Targets:
         params: TrackerParams,
         progress: bool | None,
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Compute time (us) and distance (px) of all known positions.
+        """Return times (us) of all known positions, and distances (px) of the tracks from them.
 
-        NaN where the track is not alive.
+        A distance is NaN where there is no track.
         """
         known = self.known(recording)
         if known is None:
@@ -241,13 +241,13 @@ class Targets:
 def seed_from_positions(
     known: KnownPositions, target: int, begin_us: int, size_px: float
 ) -> tuple[float, float, float, int]:
-    """Make the seed of a target from a time on, or from its first position.
+    """Make the seed of a target at a time, or at its first known position if that is later.
 
     Args:
         known: Known positions.
         target: Index of the target.
-        begin_us: Time from which it is tracked, us.
-        size_px: Size that it begins with, px.
+        begin_us: Time from which the target is tracked, us.
+        size_px: Initial size, px.
 
     Returns:
         Position x and y (px), NaN after the last known one, size (px) and time (us).
@@ -261,13 +261,13 @@ def seed_from_positions(
     return x, y, size_px, at
 
 
-# Measures that rows have in any case.
+# Measures of every row.
 MEASURE_NAMES = (
     "rmse", "median", "covered", "tracks", "missed", "false", "switches", "mota", "idf1", "hota",
     "velocity", "size", "theta", "inverse_ttc", "range",
 )  # fmt: skip
 TRACK_BEGINNINGS = ("positions", "found", "born")
-MATCH_DISTANCE_PX = 10.0  # px
+MATCH_DISTANCE_PX = 10.0  # px, default of `reach`
 
 
 def _are_pairs(value: Any) -> bool:
@@ -278,7 +278,7 @@ def _are_pairs(value: Any) -> bool:
 
 
 class TrackProtocol(Protocol):
-    """Tracks and known targets."""
+    """Protocol that compares tracks with known targets."""
 
     settings: Mapping[str, Check] = {
         **TARGET_SETTINGS,
@@ -324,19 +324,19 @@ class TrackProtocol(Protocol):
         metrics = find_metrics(options.get("metrics", ()), MEASURE_NAMES)
         noise: dict[str, Any] = {}
         if isinstance(method, MethodFunction):
-            mean, covariance = _of_function(recording, method, known.t)
+            mean, covariance = _estimate_by_function(recording, method, known.t)
         else:
             params = params or method.Params()
             tracks = _track(
                 recording, method, params, begin=begin, targets=targets, known=known,
                 options=options, progress=progress,
             )  # fmt: skip
-            mean, covariance = _states(tracks, known.t)
+            mean, covariance = _read_states(tracks, known.t)
             noise = {"Q_lambda": float(tracks.params.Q_lambda), "smoothed": tracks.smooth}
         seconds = time.perf_counter() - clock
         matched = score_tracks(known.xi, mean[..., :2], options.get("reach", MATCH_DISTANCE_PX))
         own = matched.match
-        # A tracker that starts at the true positions keeps their order: track k is of target k.
+        # A tracker that starts at the true positions keeps their order: track k is target k's.
         if begin == "positions" and not isinstance(method, MethodFunction):
             own = np.where(np.isfinite(mean[..., 0]), np.arange(mean.shape[1]), -1)
         given = np.isfinite(known.xi).all(2)
@@ -350,7 +350,9 @@ class TrackProtocol(Protocol):
             "median": float(np.median(distance[alive])) if alive.any() else None,
             "covered": float(alive.mean()),
             **{name: getattr(matched, name) for name in names},
-            **_errors(known, mean, covariance, options, noise=noise, recording=recording.name),
+            **_quantity_errors(
+                known, mean, covariance, options, noise=noise, recording=recording.name
+            ),
             **{m.name: m(xi, known.xi, recording.name) for m in metrics},
             **own_names(metrics),
             "times": len(distance),
@@ -376,12 +378,12 @@ def _track(
     options: Mapping[str, Any],
     progress: bool | None,
 ) -> Tracks:
-    """Track the targets of a recording, which begin as the protocol states.
+    """Track the targets of a recording from the beginning that the protocol states.
 
     Args:
         recording: The recording.
         method: The tracker.
-        params: Its parameters.
+        params: Parameters of the tracker.
         begin: "positions" for known positions, "born" for detection, "found" for a search.
         targets: Seeds of the configuration.
         known: True positions of the targets.
@@ -404,8 +406,8 @@ def _track(
     return method.estimate(recording, params, **settings, progress=progress)
 
 
-def _states(tracks: Tracks, t: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
-    """Read the states of tracks.
+def _read_states(tracks: Tracks, t: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
+    """Read the states of tracks at times.
 
     Args:
         tracks: The tracks.
@@ -427,14 +429,14 @@ def _states(tracks: Tracks, t: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
 
 
 def _select_matches(values: NDArray, match: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Select the values of each target's track.
+    """Select the values of the track that is matched to each target.
 
     Args:
         values: (times, tracks, ...).
         match: (times, targets) index of the track of each target, -1 for none.
 
     Returns:
-        (times, targets, ...), NaN where there is none.
+        (times, targets, ...), NaN where there is no track.
     """
     none = np.full((len(values), 1, *values.shape[2:]), np.nan)
     values = np.concatenate([values, none], 1)
@@ -447,7 +449,7 @@ def _rms(error: NDArray) -> float | None:
     return float(np.sqrt(np.mean(known**2))) if len(known) else None
 
 
-def _of_function(
+def _estimate_by_function(
     recording: Recording, method: MethodFunction, times: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Estimate states by a user's function.
@@ -469,7 +471,7 @@ def _of_function(
     return states, full
 
 
-def _errors(
+def _quantity_errors(
     known: KnownPositions,
     mean: NDArray[np.float64],
     covariance: NDArray[np.float64],
@@ -478,7 +480,7 @@ def _errors(
     noise: Mapping[str, Any],
     recording: str,
 ) -> dict[str, float | None]:
-    """Compute the errors of quantities that are known beside positions.
+    """Compute the errors of all quantities, other than positions, whose truth is known.
 
     Args:
         known: True quantities of the targets.
@@ -512,12 +514,12 @@ def _errors(
         out["range"] = _rms(np.asarray(value) / more["range"] - 1)
     if "inverse_ttc" in more:
         out["inverse_ttc"] = _rms(
-            _closing_errors(known, mean, covariance, options, noise=noise, recording=recording)
+            _inverse_ttc_errors(known, mean, covariance, options, noise=noise, recording=recording)
         )
     return out
 
 
-def _closing_errors(
+def _inverse_ttc_errors(
     known: KnownPositions,
     mean: NDArray[np.float64],
     covariance: NDArray[np.float64],
@@ -526,7 +528,7 @@ def _closing_errors(
     noise: Mapping[str, Any],
     recording: str,
 ) -> NDArray[np.float64]:
-    """Compute the errors of 1 / TTC, by pairs and by the growth of the other targets.
+    """Compute the errors of 1 / TTC, from pairs of targets and from the growth of the others.
 
     Args:
         known: True quantities of the targets.

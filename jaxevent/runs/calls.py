@@ -1,6 +1,6 @@
-"""Calls from Python, converted to tables of a configuration, so that one code path serves both.
+"""Conversion of calls from Python to tables of a configuration, so that one code path serves both.
 
-Objects that TOML has no type for stay in the table: recordings, methods, parameters, metrics, and
+Objects for which TOML has no type stay in the table: recordings, methods, parameters, metrics, and
 tables of ground truth.
 """
 
@@ -22,35 +22,35 @@ from jaxevent.runs.config import NamedRecording, TruthTables
 from jaxevent.runs.own import Metric, find_method, import_path, named_metric
 
 PathLike = str | os.PathLike
-TRUTH_SETTINGS = ("positions", "truth")  # settings that take tables
+TRUTH_SETTINGS = ("positions", "truth")  # settings that take tables of ground truth
 CALL_HEADER = "# As called from Python; objects are given by their names alone.\n"
 
 
 class CallForms(NamedTuple):
-    """The two forms of a call: with a configuration file, and with recordings and methods."""
+    """The two forms of a call: with a configuration file, or with recordings and methods."""
 
-    example: str  # of objects
-    of_file: Collection[str]  # names of arguments that a configuration may have beside it
-    of_objects: Collection[str]  # of those that tell objects from a configuration
+    example: str  # call with objects, for messages
+    with_config: Collection[str]  # arguments allowed in a call with a configuration
+    with_objects: Collection[str]  # arguments that occur only in calls with objects
 
     def is_config(self, arguments: Sequence[Any], settings: Mapping[str, Any]) -> bool:
-        """Return true if a call names a configuration rather than recordings.
+        """Return whether a call names a configuration rather than recordings.
 
         Args:
             arguments: Positional arguments.
             settings: Keyword arguments.
 
         Raises:
-            InputError: There are arguments beside the path of a TOML file that go with recordings
-                alone, or a single path is that of something else.
+            InputError: An argument is not allowed with a configuration, or the only path is not
+                that of a TOML file.
         """
         first = arguments[0] if arguments else settings.get("config")
         if first is None or not is_path(first):
             return False
-        beside = [name for name in settings if name not in self.of_file]
+        beside = [name for name in settings if name not in self.with_config]
         if Path(first).suffix != ".toml":
             method = len(arguments) > 1 and names_method(arguments[1])
-            if method or any(name in self.of_objects for name in settings):
+            if method or any(name in self.with_objects for name in settings):
                 return False
             try:
                 read_toml(first)
@@ -71,7 +71,7 @@ def is_path(value: Any) -> bool:
 
 
 def names_method(value: Any) -> bool:
-    """Return true if an argument can only be a method, or several."""
+    """Return whether an argument can only be a method or several methods."""
     if is_path(value):
         return isinstance(value, str) and (value in methods.names() or ":" in value)
     return value is not None
@@ -118,7 +118,7 @@ def methods_of(given: Any) -> list[dict[str, Any]]:
 
 
 def _is_pair(given: Any) -> bool:
-    """Tell a pair (method, params) from a tuple of two methods."""
+    """Return whether a value is a pair (method, params), not a tuple of two methods."""
     return (
         isinstance(given, tuple)
         and len(given) == 2
@@ -142,7 +142,7 @@ def _method(given: Any) -> dict[str, Any]:
 
 
 def _with_labels(tables: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Label the tables of one method by the values that differ from its defaults."""
+    """Label tables that share a method by the parameters that differ from its defaults."""
     names = [method_name(table.get("name")) for table in tables]
     for table, name in zip(tables, names, strict=True):
         params = table.get("params")
@@ -200,7 +200,7 @@ def _metric(given: Any) -> str | Metric:
 
 
 def settings_of(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert settings to TOML's types, and tables of ground truth to `TruthTables`."""
+    """Convert settings to TOML types, and tables of ground truth to `TruthTables`."""
     return {
         name: TruthTables.of(value) if name in TRUTH_SETTINGS else plain_value(value)
         for name, value in given.items()
@@ -209,7 +209,7 @@ def settings_of(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def plain_value(value: Any) -> Any:
-    """Convert a value to lists, numbers and text; parameters and recordings stay objects."""
+    """Convert a value to lists, numbers and text; `Params`, recordings and methods stay objects."""
     if isinstance(value, Parameters | Recording | Estimator | TruthTables):
         return value
     if isinstance(value, Mapping):
@@ -224,7 +224,7 @@ def plain_value(value: Any) -> Any:
 
 
 def table_with_names(value: Any) -> Any:
-    """Convert a table to one that TOML can hold: objects are replaced by their names."""
+    """Replace the objects in a table by their names, so that TOML can hold it."""
     if isinstance(value, NamedRecording):
         return table_with_names(value.recording) if is_path(value.recording) else value.name
     if isinstance(value, Recording | Metric):

@@ -234,7 +234,7 @@ class MotionProtocol(Protocol):
             )
         clock = time.perf_counter()
         if isinstance(method, MethodFunction):
-            motion = _of_function(recording, method, times, model)
+            motion = _estimate_by_function(recording, method, times, model)
         else:
             motion = method.estimate(
                 recording,
@@ -313,7 +313,7 @@ class SampledMotion(MotionEstimate):
         return Estimate(self.mean[rows], self.covariance[rows], self.valid[rows])
 
 
-def _of_function(
+def _estimate_by_function(
     recording: Recording, method: MethodFunction, times: NDArray[np.int64], model: type[Model]
 ) -> MotionEstimate:
     """Estimate motion by a user's function.

@@ -1,49 +1,50 @@
-"""Parameters fitted to recordings, as a file describes it.
+"""Fits of parameters to recordings, described by a configuration file.
 
-`fit` and the command `jaxevent fit CONFIG.toml` run the loop of `jaxevent.tuning` as a file
-describes it:
+`fit` and the command `jaxevent fit CONFIG.toml` run the optimiser of `jaxevent.tuning` with these
+settings:
 
     recordings = ["slider_depth.zip"]   # paths or globs, relative to this file; $NAME is expanded;
                                         # "mvsec:FOLDER": all of a data set
-    validation = []                     # recordings for early stopping,
-    test = []                           # and those that are only scored; if neither is given,
-    split = [2, 1, 1]                   # of every 4 images in turn 2 are fitted, 1, 1 are those
-    size = [240, 180]                   # only for recordings that do not tell it
+    validation = []                     # recordings for early stopping
+    test = []                           # recordings that are only scored; if neither is given,
+    split = [2, 1, 1]                   # of every 4 images 2 are for the fit, 1 for early stopping,
+                                        # and 1 is only scored
+    size = [240, 180]                   # only for recordings that do not state it
     stream = "left"                     # only for files of several cameras
     window = 1.0                        # s, of mini-batches; omitted: whole recordings
     batch = 4                           # windows per step; omitted: all
     iterations = 300                    # and the other fields of `Settings`
     loss = "held-out"                   # or "reference" (protocols of `jaxevent.runs.evaluate`), or
                                         # "likelihood" of the frames that the protocol gives
-    protocol = "held-out"               # with the likelihood: what is given, and scored
+    protocol = "held-out"               # for the likelihood: protocol of frames given and scored
     error = "linear"                    # or "log", "nll"; see `jaxevent.runs.reconstruction`
     dark_offset = 0.003                 # of the error "log"
     weights = { dark = 1, bright = 1 }  # of pixels of HDR references outside what frames record
     calibrate = false                   # start from the defaults, see below
-    warm_up = 0.2                       # s that are prepared around a window
-    gap = 2                             # of the protocol "held-out": every gap-th frame is given
+    warm_up = 0.2                       # s of data that are prepared around a window
+    gap = 2                             # for the protocol "held-out": every gap-th frame is given
 
     [[method]]
     name = "akf"                        # a key of jaxevent.METHODS, or "package.module:object"
     label = "akf, mine"                 # in the results; omitted: the name
-    params = { c_on = 0.08 }            # to start from, or a TOML file; omitted:
+    params = { c_on = 0.08 }            # initial values, or a TOML file; omitted:
                                         # calibrated, else defaults
     fit = ["c_on", "c_off"]             # by gradient
     search = { clock_offset = [-0.02, 0.02, 9] }  # from, to, number of points
-    prior = { c_on = [0.1, 0.5] }       # what is believed, standard deviation of its logarithm
+    prior = { c_on = [0.1, 0.5] }       # expected value, standard deviation of its logarithm
     prior_weight = 1.0                  # twice what one standard deviation adds to the loss
 
-Clock and thresholds that `params` does not give start from the median of what the recordings to
-fit show, of the frames given (`jaxevent.calibration`), unless `calibrate` is false.
+Clock and thresholds that `params` does not give start from a calibration with the given frames
+(`jaxevent.calibration`), the median over the recordings to fit, unless `calibrate` is false.
 
 A method may have its own calibrate, loss, error, learning_rate, iterations, starts and
-prior_weight. Parameters that are fixed when a recording is prepared have no gradient to follow;
-each candidate of a search is prepared anew. Values omitted are those above, except where comments
-say otherwise, and no prior.
+prior_weight. Parameters that act when a recording is prepared have no gradient; they are searched,
+and each candidate of a search is prepared anew. Defaults are the values above, except where
+comments say otherwise, and no prior.
 
 The settings from `loss` on are those of reconstruction; `jaxevent.runs.blob` and
-`jaxevent.runs.egomotion` tell those of the other families. Several processes fit together:
-`jaxevent.processes`.
+`jaxevent.runs.egomotion` describe those of the other families. Several processes can share a fit:
+see `jaxevent.processes`.
 """
 
 import contextlib
@@ -139,49 +140,49 @@ def fit(*arguments: Any, **settings: Any) -> Fits:
         fitted = fit(recording, akf, fit=["c_on", "c_off"])
         fitted.params.c_on
 
-    The first form runs what a TOML file describes; its layout is in the text of this module. The
-    second fits one method and takes the same as Python objects.
+    The first form runs a configuration in TOML; the text of this module describes its layout. The
+    second fits one method and takes the same settings as Python objects.
 
     Writes the folder `out`, made if missing: params.toml (a table of physical values for each
     method), results.json ({"rows": [...], "found": [...], "gains": [...]}), results.md, loss.csv,
-    loss.png (with the extra "plot") and config.toml. results.md has the table of the test images,
-    then every number that was fitted with its start and its interval (`jaxevent.confidence`), what
-    ran to a bound or away, and the gain. While it runs, `out` holds a checkpoint at most a few
-    seconds old, by which an interrupted run goes on and ends with the same parameters, to the bit.
-    Of several processes (`processes.join`) all read the recordings and return the rows, and the
-    first reads and writes `out`.
+    loss.png (with the extra "plot") and config.toml. results.md has the scores on the test images,
+    every fitted number with its initial value and interval (`jaxevent.confidence`), numbers that
+    reached a bound or diverged, and the gain. During the fit `out` holds a checkpoint at most a few
+    seconds old. An interrupted run that is resumed from it ends with exactly the same parameters.
+    With several processes (`processes.join`) all read the recordings and return the rows, and the
+    first one reads and writes `out`.
 
     Args:
         config: The TOML file.
-        recordings: To be fitted to: a `Recording` or a path, a list of them, or a mapping from
-            names. With a file, a list in place of the file's.
+        recordings: Recordings to fit to: a `Recording` or a path, a list of them, or a mapping from
+            names. With a file, a list that replaces the file's.
         method: A name, an `Estimator`, or "package.module:object".
         fit: Names of parameters to fit by gradient.
         search: Names of parameters to search, each with (from, to, number of points).
-        params: To start from: the method's `Params`, a mapping, or the path of a TOML file.
+        params: Initial values: the method's `Params`, a mapping, or the path of a TOML file.
         validation: Recordings for early stopping; omitted, a share of the images or windows.
-        test: Recordings that are only scored; omitted, likewise.
-        out: The folder; earlier results in it are replaced at the end. Omitted, of objects, nothing
-            is written.
-        resume: Go on from the checkpoint in `out`. Where the run had not got to the first one, it
-            starts; where it had ended, its rows are returned.
-        progress: Whether bars are shown; None: where somebody looks on.
-        replace: Whether files in `out` may be replaced that are not of the fit that goes on.
-        calibrate: Whether clock and thresholds that are not given start from what the recordings
-            show; None: as the file says, or true.
-        **settings: The other settings of a configuration, as `iterations=100` or `window=0.5`.
+        test: Recordings that are only scored; omitted, a share of the images or windows.
+        out: The folder; earlier results in it are replaced at the end. With objects it may be
+            omitted, and nothing is written.
+        resume: Continue from the checkpoint in `out`. A run without a checkpoint starts anew; of
+            a finished run the rows are returned.
+        progress: Whether to show bars; None shows them in a terminal or notebook.
+        replace: Whether files in `out` that do not belong to the resumed fit may be replaced.
+        calibrate: Whether clock and thresholds that are not given start from a calibration of the
+            recordings; None: as the file says, or true.
+        **settings: The other settings of a configuration, such as `iterations=100` or `window=0.5`.
             `positions` and `truth` also take a DataFrame, or a mapping from recordings' names to
-            them.
+            DataFrames.
 
     Returns:
-        Rows as `evaluate.score` gives them, of the recordings and images of each split, with the
-        fitted `params`: see `Fits`. `split` is "fit", "validation" or "test", `method` the label,
-        with ", before" for the start values. Where the steps led away, so that the best that was
-        seen counts, `warning` says so. Those of the tracker are described in `jaxevent.runs.blob`.
+        Rows for the recordings and images of each split, like those of `evaluate`, with the fitted
+        `params`: see `Fits`. `split` is "fit", "validation" or "test"; `method` is the label, with
+        ", before" for the initial values. `warning` is present if the fit diverged, so that the
+        result is the best point seen. Rows of trackers are described in `jaxevent.runs.blob`.
 
     Raises:
-        InputError: The file, a recording or a parameter cannot be used, `out` cannot be written,
-            holds another run's checkpoint or is written by another process.
+        InputError: The file, a recording or a parameter cannot be used, or `out` cannot be written,
+            holds another run's checkpoint or is in use by another process.
     """
     if CALL_FORMS.is_config(arguments, settings):
         return _fit_file(*arguments, **settings)
@@ -207,7 +208,7 @@ def _fit_file(
     if out is None:
         raise InputError(f"{config}: out is missing; give the folder of the results")
     plan = processes.on_all_processes(lambda: read_plan(Path(config), recordings, calibrate))
-    return _fit(plan, Path(out), resume, progress, replace)
+    return _run_plan(plan, Path(out), resume, progress, replace)
 
 
 def _fit_objects(
@@ -238,8 +239,8 @@ def _fit_objects(
     text = CALL_HEADER + toml.dump(table_with_names(table))
     plan = processes.on_all_processes(lambda: plan_of(table, Path(), None, text.encode()))
     if out is None:
-        return _fit(plan, None, resume, progress, replace)
-    # By these lines `resume` knows the recordings of a run that had ended.
+        return _run_plan(plan, None, resume, progress, replace)
+    # `resume` recognises the recordings of a finished run by these lines.
     lines = [
         f"# {toml.text(name)} holds {digest(recording)}\n"
         for split in SPLIT_NAMES
@@ -247,23 +248,27 @@ def _fit_objects(
         if isinstance(recording, Recording)
     ]
     plan = dataclasses.replace(plan, text="".join(lines).encode() + plan.text)
-    return _fit(plan, Path(out), resume, progress, replace)
+    return _run_plan(plan, Path(out), resume, progress, replace)
 
 
 # Settings of a method, not of the file.
 METHOD_SETTINGS = ("fit", "search", "params", "label", "prior")
 
 
-def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, replace: bool) -> Fits:
+def _run_plan(
+    plan: Plan, out: Path | None, resume: bool, progress: bool | None, replace: bool
+) -> Fits:
     """Fit the methods of a plan; see `fit`."""
     progress = progress if processes.is_process_zero() else False
     with contextlib.ExitStack() as held:
         if out is not None:
-            rows = processes.on_process_zero(lambda: _ended_rows(out, plan, resume, replace, held))
+            rows = processes.on_process_zero(
+                lambda: _finished_run_rows(out, plan, resume, replace, held)
+            )
             if rows is not None:
-                return _read_finished(rows, out, plan)
+                return _read_finished_run(rows, out, plan)
         data = processes.on_all_processes(lambda: _load_all(plan, progress))
-        plan = processes.on_all_processes(lambda: calibrated_plan(plan, data))
+        plan = processes.on_all_processes(lambda: calibrate_plan(plan, data))
         key = ""
         if out is not None or not processes.is_single():
             key = processes.on_all_processes(plan.digest)
@@ -294,15 +299,15 @@ def _fit(plan: Plan, out: Path | None, resume: bool, progress: bool | None, repl
     return fits
 
 
-def calibrated_plan(plan: Plan, data: FitData) -> Plan:
-    """Return a plan whose fits start from what the recordings to fit show.
+def calibrate_plan(plan: Plan, data: FitData) -> Plan:
+    """Return a plan whose fits start from a calibration of the recordings.
 
     Args:
         plan: The plan.
-        data: Its recordings.
+        data: Recordings of the plan.
 
     Returns:
-        The plan with other parameters to start from.
+        The plan with other initial parameters.
     """
     tasks = [
         dataclasses.replace(task, params=task.goal.calibrate(data, task.params, task.left_open))
@@ -323,13 +328,13 @@ def _format_report(tasks: Sequence[Task], rows: Any, found: Any, gained: Any) ->
     return _format_scores(tasks, rows_outside_fit(rows)) + format_findings(found, gained)
 
 
-def _read_finished(rows: list[dict[str, Any]], out: Path, plan: Plan) -> Fits:
-    """Read the result of a run that had ended from its folder.
+def _read_finished_run(rows: list[dict[str, Any]], out: Path, plan: Plan) -> Fits:
+    """Read the result of a finished run from its folder.
 
     Args:
-        rows: Its scores.
+        rows: Scores of the run.
         out: The folder.
-        plan: Its plan.
+        plan: Plan of the run.
     """
     kept = json.loads((out / "results.json").read_bytes())
     params = {
@@ -339,17 +344,17 @@ def _read_finished(rows: list[dict[str, Any]], out: Path, plan: Plan) -> Fits:
     return Fits(rows, params, found, gained, _format_report(plan.tasks, rows, found, gained))
 
 
-def _ended_rows(
+def _finished_run_rows(
     out: Path, plan: Plan, resume: bool, replace: bool, held: contextlib.ExitStack
 ) -> list[dict[str, Any]] | None:
-    """Return the rows of a run that had ended and is to go on; None if it is to be computed.
+    """Return the rows of a finished run that is resumed; None if the fit must be computed.
 
-    A folder that exists is held until the stack is closed.
+    An existing folder is locked until the stack is closed.
 
     Args:
         out: Folder of the results.
         plan: The plan.
-        resume: Whether the run is to go on.
+        resume: Whether to resume a run.
         replace: Whether existing files may be replaced.
         held: Stack that holds the lock of the folder.
 
@@ -357,8 +362,8 @@ def _ended_rows(
         The rows, or None.
 
     Raises:
-        InputError: The folder holds the checkpoint of an interrupted fit, and is not to go on; or
-            it holds files that may not be replaced.
+        InputError: The folder holds the checkpoint of an interrupted fit that is not resumed, or
+            files that may not be replaced.
     """
     if out.is_dir():
         held.enter_context(lock_folder(out))
@@ -382,21 +387,20 @@ def _fit_tasks(
     progress: bool | None,
     held: contextlib.ExitStack,
 ) -> tuple[list[FitResult], list[dict[str, Any]], Any]:
-    """Fit all methods, from the checkpoint in the folder on, if there is a folder.
+    """Fit all methods, starting from the checkpoint in the folder if there is one.
 
-    The folder is made if missing, and then held until the stack is closed.
+    The folder is made if missing, and locked until the stack is closed.
 
     Args:
         plan: The plan.
-        data: Its recordings.
-        key: Hash of the plan, which a checkpoint must have.
+        data: Recordings of the plan.
+        key: Hash of the plan, which must match the checkpoint's.
         out: Folder of the results, or None.
         progress: Whether to show progress.
         held: Stack that holds the lock of the folder.
 
     Returns:
-        The fits, rows about the numbers that they found, and the function that writes to the
-            folder.
+        The fits, rows about the fitted numbers, and the function that writes to the folder.
 
     Raises:
         InputError: A fit cannot be done; the message names the method.
@@ -409,17 +413,17 @@ def _fit_tasks(
     with contextlib.ExitStack() as new:
 
         def open_folder(out: Path) -> bytes | None:
-            """The checkpoint in the folder."""
+            """Open the folder and return the content of its checkpoint, if any."""
             nonlocal write
-            # `results` removes a folder that it made if the block raises. At the first checkpoint
-            # the block ends: from then on the folder stays.
+            # `open_results` removes a folder that it made if its block raises. The block ends at
+            # the first checkpoint; from then on the folder stays.
             missing = not out.exists()
             write = new.enter_context(open_results(out))
             if missing:
                 held.enter_context(lock_folder(out))
             checkpoint = out / CHECKPOINT_FILE
             content = checkpoint.read_bytes() if checkpoint.exists() else None
-            for remains in out.glob(".*.part"):  # of a write during which the run was killed
+            for remains in out.glob(".*.part"):  # of an interrupted write
                 remains.unlink(missing_ok=True)
             return content
 
@@ -462,7 +466,7 @@ def _fit_tasks(
 def _score(
     plan: Plan, done: Sequence[FitResult], data: FitData, progress: bool | None
 ) -> list[dict[str, Any]]:
-    """Score all methods before and after the fit; several processes share the work."""
+    """Score all methods with their initial and their fitted parameters, shared among processes."""
     scored: list[tuple[Task, str, Any, dict[str, str]]] = []
     for task, one in zip(plan.tasks, done, strict=True):
         warning = {"warning": DIVERGED_WARNING.format(task.label)} if one.diverged else {}
@@ -480,7 +484,7 @@ def _score(
 
 
 def _format_scores(tasks: Sequence[Task], rows: Sequence[dict[str, Any]]) -> str:
-    """Format the scores of results.md: one table for the methods of each system.
+    """Format the scores of results.md: one table for the methods of each family.
 
     Args:
         tasks: Methods of the fit.
@@ -496,7 +500,8 @@ def _format_scores(tasks: Sequence[Task], rows: Sequence[dict[str, Any]]) -> str
 
 
 def rows_outside_fit(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the rows of the test images; where there are none, of the validation or the fit."""
+    """Return the rows of the test images, else those of the validation, else those of the fit."""
+
     for split in reversed(SPLIT_NAMES):
         chosen = [row for row in rows if row["split"] == split]
         if chosen:

@@ -564,7 +564,7 @@ def score_and_sample(
         estimates = _read_external_images(given, hidden, method, name or recording.name)
         values, I0 = method.values(), 0.0
     elif isinstance(method, MethodFunction):
-        estimates = _of_function(given, hidden, method)
+        estimates = _estimate_by_function(given, hidden, method)
         values, I0 = {}, 0.0
     else:
         chosen, calibrated = _calibrate(given, method, params, options.calibrate)
@@ -670,7 +670,7 @@ def _estimate_hidden_images(
         first += len(times)
 
 
-def _of_function(given: Recording, hidden: Frames, method: MethodFunction) -> Estimates:
+def _estimate_by_function(given: Recording, hidden: Frames, method: MethodFunction) -> Estimates:
     shape = (given.height, given.width)
     found = method.estimate(given, hidden.t, [shape], intensity=True)
     variance = found.covariance

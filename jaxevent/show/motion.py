@@ -1,4 +1,4 @@
-"""Files of a motion: tables, HDF5, and the figures of `motion_figures`."""
+"""Files of an estimated motion: tables, HDF5, and the figures of `motion_figures`."""
 
 import dataclasses
 import json
@@ -47,7 +47,7 @@ def write_motion_table(
 ) -> None:
     """Write a motion as CSV: t (s), the components, sigma_<component>, lost (0 or 1).
 
-    A sigma is the square root of its component's variance. Where the motion is lost both are empty.
+    sigma is the square root of a component's variance. Where the motion is lost, both are empty.
 
     Args:
         path: File that is written.
@@ -59,7 +59,7 @@ def write_motion_table(
 
 
 class LiveTable:
-    """Table of a live motion, row by row, as `write_motion_table` writes that of a recording.
+    """Table of a live motion, made row by row, with the columns of `write_motion_table`.
 
     Args:
         live: The live motion.
@@ -74,7 +74,7 @@ class LiveTable:
         self._live, self._period, self._count, self._first = live, 1e6 / rate, 0, 0
 
     def rows(self) -> str:
-        """Return the lines of CSV whose estimates are new; the first ones follow the header."""
+        """Return the lines of CSV that are new; the first call with lines adds the header."""
         motion = self._live.motion
         if not len(motion):
             return ""
@@ -91,7 +91,7 @@ class LiveTable:
         return text
 
 
-def write_known(
+def write_known_motion(
     path: str | Path,
     model: str | type[Model],
     times: NDArray[np.int64],
@@ -133,7 +133,7 @@ def write_motion(
 
     Args:
         path: File that is written.
-        motion: A motion.
+        motion: The motion.
         about: Further attributes, numbers and texts.
         method: Name of the method that estimated the motion.
         params: Parameters of the method.
@@ -180,13 +180,13 @@ def write_errors(folder: Path, errors: MotionScores) -> None:
         partial.write_text(json.dumps({"figures": table, **about}, indent=2) + "\n")
 
 
-def fitted_velocity(
+def motion_at_fitted_depth(
     recording: Recording, motion: MotionEstimate, span: float | int = 0.02
 ) -> KnownMotion:
-    """Return the motion from poses at the one depth that fits an estimate.
+    """Convert poses to an image velocity, at the one depth of the scene that best fits an estimate.
 
-    The depth is not observable from poses. So only directions of an image velocity, and changes of
-    its speed, are compared with a truth. See `Model.from_twists_at_fitted_depth`.
+    Poses do not determine the depth. So only the direction of the estimate, and changes of its
+    speed, are tested. See `Model.from_twists_at_fitted_depth`.
 
     Args:
         recording: Recording with poses and calibration.
@@ -194,7 +194,7 @@ def fitted_velocity(
         span: Time over which poses are differentiated, s.
 
     Raises:
-        InputError: There are no poses or no calibration.
+        InputError: The recording has no poses or no calibration.
     """
     model = motion.model
     if recording.poses is None or recording.camera is None:
@@ -211,30 +211,32 @@ def fitted_velocity(
     return KnownMotion(model, twists.t, model.from_twists_at_fitted_depth(twists, f, mean))
 
 
-class Truth(NamedTuple):
-    """A known motion, its source in words, and further lines about it."""
+class ReferenceMotion(NamedTuple):
+    """Known motion with which an estimate is compared."""
 
     known: KnownMotion
-    words: str
-    notes: tuple[str, ...] = ()
+    source: str  # in words, such as "poses"
+    notes: tuple[str, ...] = ()  # lines to print about it
 
 
-def measured_rotation(truth: KnownMotion, motion: MotionEstimate, unbiased: bool) -> Truth:
+def prepare_gyro_reference(
+    truth: KnownMotion, motion: MotionEstimate, unbiased: bool
+) -> ReferenceMotion:
     """Prepare the angular velocity of a gyro for the comparison with an estimate.
 
-    Without a known bias the constant that fits the estimate is subtracted. Without a known rotation
-    a note names other axes that fit far better.
+    If the bias is unknown, the constant that best fits the estimate is subtracted. If other axes of
+    the gyro fit far better, a note names them.
 
     Args:
-        truth: Angular velocity of the gyro.
+        truth: Angular velocity measured by the gyro.
         motion: The estimate.
-        unbiased: Whether the bias is known and subtracted.
+        unbiased: Whether a known bias is already subtracted.
     """
     estimated = motion(truth.t, centred=True, extrapolate=True)
     rows = estimated.valid & np.isfinite(estimated.mean).all(1)
-    words, notes = "the gyro", []
+    source, notes = "the gyro", []
     if not rows.any():
-        return Truth(truth, words)
+        return ReferenceMotion(truth, source)
     estimate, measured = estimated.mean[rows], truth.values[rows]
     axes = find_gyro_axes(motion, truth)
     truth = dataclasses.replace(truth, guesses_axes=False)  # the note is enough
@@ -245,23 +247,23 @@ def measured_rotation(truth: KnownMotion, motion: MotionEstimate, unbiased: bool
         )
     elif not unbiased:
         bias = fit_gyro_bias(estimate, measured)
-        words = "the gyro without its bias"
+        source = "the gyro without its bias"
         notes.append(
             f"a constant of {', '.join(f'{v:+.3f}' for v in bias)} rad/s was taken off the gyro: "
             "its bias, or the estimate's, which --still S,S tells apart"
         )
         truth = dataclasses.replace(truth, values=truth.values - bias)
-    return Truth(truth, words, tuple(notes))
+    return ReferenceMotion(truth, source, tuple(notes))
 
 
 @dataclasses.dataclass(frozen=True)
 class Output:
-    """Destination of a motion: `output.write(recording, motion, ...)`.
+    """Folder to which a motion is written by `output.write(recording, motion, ...)`.
 
-    `path` is a folder for
+    The folder `path` gets
 
-    - motion.csv: a row for each of `rate` times per second, see `write_motion_table`;
-    - motion.h5: the estimates as they were made, see `write_motion`;
+    - motion.csv: `rate` rows per second, see `write_motion_table`;
+    - motion.h5: the estimates at their own times, see `write_motion`;
     - motion.png: the components over time, see `motion_figure`;
     - warped.png: the events of a short window before and after warping along the motion;
     - errors.csv and errors.json, with a truth: see `MotionScores`;
@@ -269,9 +271,9 @@ class Output:
       window's events in colours of their flow.
 
     `truth` is "auto" (the recording's poses, else its gyro), the path of a table with the columns
-    of motion.csv, or None. `centred` estimates count for the middle of the events that they use.
-    Without the extra "plot" the figures are left out. `InputError` is raised for settings that are
-    not possible and a place that cannot be written.
+    of motion.csv, or None. `centred` estimates hold at the middle of the events that they use.
+    Without the extra "plot" there are no figures. `InputError` is raised for invalid settings and
+    for a path that cannot be written.
     """
 
     path: Path
@@ -288,23 +290,23 @@ class Output:
         check_rate(self.rate)
         check_writable(self.path, directory=True)
 
-    def known(
+    def make_reference(
         self,
         recording: Recording,
         model: str | type[Model],
         bias: NDArray[np.float64] | None = None,
         rotation: NDArray[np.float64] | None = None,
         depth: float | int | None = None,
-    ) -> Callable[[MotionEstimate], Truth] | None:
-        """Return a function from the estimated motion to its truth; None without a truth.
+    ) -> Callable[[MotionEstimate], ReferenceMotion] | None:
+        """Return a function from an estimate to the motion it is compared with; None without truth.
 
-        A gyro is used if there are no poses, see `measured_rotation`.
+        A gyro is used if there are no poses, see `prepare_gyro_reference`.
 
         Args:
             recording: Recording of the motion.
             model: Motion model, or its name.
-            bias: (3,) rad/s, bias of the gyro; None if it is not known.
-            rotation: (3, 3) from the gyro's axes to the camera's; None if it is not known.
+            bias: (3,) rad/s, bias of the gyro; None if unknown.
+            rotation: (3, 3) from the gyro's axes to the camera's; None if unknown.
             depth: Depth of the scene, m.
 
         Raises:
@@ -314,41 +316,41 @@ class Output:
             return None
         model = find_model(model)
         if self.truth != "auto":
-            table = Truth(known_motion(recording, model, self.truth), str(self.truth))
+            table = ReferenceMotion(known_motion(recording, model, self.truth), str(self.truth))
             return lambda motion: table
         if depth is not None:
-            at = Truth(
+            at = ReferenceMotion(
                 known_motion(recording, model, depth=depth), f"poses at the depth {depth:g} m"
             )
             return lambda motion: at
         if model.fits_depth and recording.poses is not None and recording.camera is not None:
-            words = "poses at one fitted depth"
-            return lambda motion: Truth(fitted_velocity(recording, motion), words)
+            source = "poses at one fitted depth"
+            return lambda motion: ReferenceMotion(motion_at_fitted_depth(recording, motion), source)
         zero = np.zeros(3) if bias is None else bias
         truth = known_motion(recording, model, "auto", zero, rotation=rotation)
         if recording.poses is not None:
-            return lambda motion: Truth(truth, "poses")
-        return lambda motion: measured_rotation(truth, motion, bias is not None)
+            return lambda motion: ReferenceMotion(truth, "poses")
+        return lambda motion: prepare_gyro_reference(truth, motion, bias is not None)
 
     def write(
         self,
         recording: Recording,
         motion: MotionEstimate,
         about: Mapping[str, Any] = MappingProxyType({}),
-        truth: Callable[[MotionEstimate], Truth] | None = None,
+        truth: Callable[[MotionEstimate], ReferenceMotion] | None = None,
         *,
         progress: bool | None = None,
         method: str | None = None,
         params: Parameters | None = None,
     ) -> "WrittenMotion":
-        """Write everything, complete or not at all.
+        """Write all files; if anything fails, none is written.
 
         Args:
             recording: Recording of the motion.
-            motion: A motion.
+            motion: The motion.
             about: Further attributes of motion.h5.
-            truth: Function that `known` returned.
-            progress: Whether a bar is shown; None: in a terminal or notebook.
+            truth: Function that `make_reference` returned.
+            progress: Whether to show a bar; None shows it in a terminal or notebook.
             method: Name of the method that estimated the motion.
             params: Parameters of the method.
         """
@@ -360,7 +362,12 @@ class Output:
         errors = None
         if true is not None:
             errors = score_motion(
-                motion, true.known, times, start=start, centred=self.centred, description=true.words
+                motion,
+                true.known,
+                times,
+                start=start,
+                centred=self.centred,
+                description=true.source,
             )
             errors = dataclasses.replace(errors, notes=true.notes)
         outliers = None
@@ -408,23 +415,23 @@ class WrittenMotion:
     left_out: str | None = None  # the reason why there are no figures
 
     def summary(self) -> list[str]:
-        """Return lines to print: the time found, means and spreads, errors, missing figures."""
+        """Return a summary to print: times with a motion, components, errors, missing figures."""
         lines = self._describe_motion()
         if self.left_out is not None:
             lines += ["", f"pictures are left out: {self.left_out}"]
         return lines
 
-    def _count(self) -> str:
-        """Count the estimates, without those that are held."""
+    def _format_count(self) -> str:
+        """Format the number of estimates, without extensions to the ends of the events."""
         number = len(self.motion) - self.motion.n_extended
         return format_count(number, "estimate")
 
     def _describe_motion(self) -> list[str]:
-        """Return lines about when the motion was found, its components and errors."""
+        """Return lines about the times when the motion was found, its components and its errors."""
         lost = ~self.estimated.valid
         first = np.flatnonzero(~lost)
         if not len(first):
-            lines = [f"{self._count()}: the motion was never found"]
+            lines = [f"{self._format_count()}: the motion was never found"]
             return [
                 *lines,
                 "another --model or --method, or --params of other windows, may find it",
@@ -432,7 +439,8 @@ class WrittenMotion:
         since = (self.times[first[0]] - self.times[0]) * 1e-6
         later = lost[first[0] :].mean()
         lines = [
-            f"{self._count()}, found after {since:.3f} s, then lost {100 * later:.2f} % of the time"
+            f"{self._format_count()}, found after {since:.3f} s, "
+            f"then lost {100 * later:.2f} % of the time"
         ]
         mean = self.estimated.mean[first]
         sigma = np.sqrt(np.diagonal(self.estimated.covariance[first], axis1=1, axis2=2).clip(0))

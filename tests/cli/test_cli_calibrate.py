@@ -19,7 +19,7 @@ from jaxevent.errors import InputError
 from jaxevent.recording import Frames
 from jaxevent.runs.evaluate import evaluate
 from jaxevent.runs.family import FitData
-from jaxevent.runs.fit import calibrated_plan
+from jaxevent.runs.fit import calibrate_plan
 from jaxevent.runs.fit_config import plan_of
 from jaxevent.runs.protocols import held_out
 from jaxevent.simulate.faults import add_hot_pixels, flicker_frames
@@ -250,7 +250,7 @@ def test_fits_start_from_the_median_of_recordings(recording):
     ]
     plan = plan_of({"recordings": [recording, other], "method": methods}, Path(), None, b"")
     sources = {"fit": [("part", recording), ("other", other)], "validation": [], "test": []}
-    started = calibrated_plan(plan, FitData(sources))
+    started = calibrate_plan(plan, FitData(sources))
     for task, expected in zip(
         started.tasks,
         [(clock, on, off), (clock, 0.3, off), (0, 0.1, 0.1), (0, 0.1, 0.1)],

@@ -339,7 +339,9 @@ def test_general_motion_is_written_too(tmp_path):
         motion_of(known, ~lost), cloud=np.zeros((len(known.t), 3, 6)) + known.values[:, None]
     )
     output = pictures.Output(tmp_path / "out")
-    written = output.write(recording, motion, {}, lambda _: pictures.Truth(known, "itself"))
+    written = output.write(
+        recording, motion, {}, lambda _: pictures.ReferenceMotion(known, "itself")
+    )
     header, table = read_table(tmp_path / "out" / "motion.csv")
     names = ["tx", "ty", "tz", "wx", "wy", "wz"]
     assert header == ["t", *names, *(f"sigma_{name}" for name in names), "lost"]
@@ -405,11 +407,13 @@ def test_velocity_of_poses_at_the_depth_that_fits():
     recording, source = motion_scene("planar", "varying", size=(8, 6), focal=80.0, duration=0.3)
     t = np.arange(0, 300_001, 1000)
     motion = motion_of(KnownMotion(Planar, t, 1.02 * source.velocity(t)))
-    told = pictures.fitted_velocity(recording, motion)
+    told = pictures.motion_at_fitted_depth(recording, motion)
     np.testing.assert_allclose(told.values, 1.02 * source.velocity(told.t), rtol=0.02)
     for missing in ("poses", "camera"):
         with pytest.raises(InputError, match="which determine an image velocity"):
-            pictures.fitted_velocity(dataclasses.replace(recording, **{missing: None}), motion)
+            pictures.motion_at_fitted_depth(
+                dataclasses.replace(recording, **{missing: None}), motion
+            )
 
 
 def test_nothing_found_is_said(tmp_path, capsys, monkeypatch):
@@ -418,7 +422,7 @@ def test_nothing_found_is_said(tmp_path, capsys, monkeypatch):
     events = Events(t, x.astype(np.uint16), y.astype(np.uint16), x % 2 == 0)
     jaxevent.save(Recording("stray", WIDTH, HEIGHT, events), tmp_path / "stray.h5")
     (tmp_path / "mine.toml").write_text(SETTINGS)
-    pictures.write_known(tmp_path / "true.csv", "planar", t, np.ones((len(t), 2)))
+    pictures.write_known_motion(tmp_path / "true.csv", "planar", t, np.ones((len(t), 2)))
     truth = ["--truth", tmp_path / "true.csv"]
     # Without --model it is chosen; nothing is seen to move here.
     fails(capsys, ["motion", tmp_path / "stray.h5", "--out", tmp_path / "out"], "stray.h5", "move")
