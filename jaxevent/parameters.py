@@ -98,7 +98,7 @@ class Number(Setting):
                 f"gradient.per_unit(params)[{self.name!r}], by the parameter"
             )
         raw = instance.raw[self.name]
-        follows = self.gradient or self.name in instance.followed
+        follows = self.gradient or self.name in instance.added_derivatives
         return self.physical(raw if follows else jax.lax.stop_gradient(raw))
 
     if TYPE_CHECKING:  # type of the argument of a `Params` class
@@ -281,13 +281,13 @@ class _ParameterArrays(_Module):
     raw: dict[str, Array]  # numbers in unconstrained form, by name
     # choices and counts, by name
     chosen: tuple[tuple[str, str | bool | int], ...] = eqx.field(static=True)
-    followed: frozenset[str] = eqx.field(static=True)  # see `Parameters.with_derivatives`
+    added_derivatives: frozenset[str] = eqx.field(static=True)  # see `Parameters.with_derivatives`
     # Tells parameters, 1, from gradients and differences of parameters, 0. Nothing depends on it,
     # so JAX makes it 0 in every gradient and tangent (a homogeneous coordinate of `raw`).
-    point: Array
+    homogeneous: Array
 
 
-_FIELDS = frozenset({"raw", "chosen", "followed", "point"})
+_FIELDS = frozenset({"raw", "chosen", "added_derivatives", "homogeneous"})
 
 
 class Parameters(_ParameterArrays):
@@ -351,7 +351,8 @@ class Parameters(_ParameterArrays):
             values = {**self.presets[preset], **values}
         if fields:
             self.raw, self.chosen = fields["raw"], fields["chosen"]
-            self.followed, self.point = fields["followed"], fields["point"]
+            self.added_derivatives = fields["added_derivatives"]
+            self.homogeneous = fields["homogeneous"]
             changed = self.replace(**values)
             self.raw, self.chosen = changed.raw, changed.chosen
             return
@@ -363,8 +364,8 @@ class Parameters(_ParameterArrays):
             (name, _to_stored_setting(choice, values.get(name, choice.default)))
             for name, choice in self.choices.items()
         )
-        self.followed = frozenset()
-        self.point = jnp.asarray(np.ones((), jnp.result_type(float)))
+        self.added_derivatives = frozenset()
+        self.homogeneous = jnp.asarray(np.ones((), jnp.result_type(float)))
 
     @classmethod
     def settings(cls) -> dict[str, Setting]:
@@ -400,8 +401,8 @@ class Parameters(_ParameterArrays):
     @property
     def is_gradient(self) -> bool:
         """True for a gradient or a difference of parameters; false while JAX traces it."""
-        return isinstance(self.point, Array | np.ndarray) and not (
-            isinstance(self.point, Tracer) or np.any(np.asarray(self.point))
+        return isinstance(self.homogeneous, Array | np.ndarray) and not (
+            isinstance(self.homogeneous, Tracer) or np.any(np.asarray(self.homogeneous))
         )
 
     def per_unit(self, params: "Parameters") -> dict[str, Array]:
@@ -428,7 +429,7 @@ class Parameters(_ParameterArrays):
                 f"per_unit needs the {type(self).__qualname__} at which the gradient was taken, "
                 f"not {describe_value_type(params)}; give gradient.per_unit(params)"
             )
-        if not (self.is_gradient or isinstance(self.point, Tracer)):
+        if not (self.is_gradient or isinstance(self.homogeneous, Tracer)):
             raise InputError(
                 "per_unit converts a gradient and these are parameters; call it as "
                 "jax.grad(loss)(params).per_unit(params)"
@@ -437,7 +438,7 @@ class Parameters(_ParameterArrays):
         for name, number in self.numbers.items():
             raw = jnp.asarray(params.raw[name])
             _, slope = jax.jvp(number.physical, (raw,), (jnp.ones_like(raw),))
-            unknown = jnp.nan if number.gradient or name in params.followed else 0.0
+            unknown = jnp.nan if number.gradient or name in params.added_derivatives else 0.0
             found[name] = jnp.where(slope == 0, unknown, self.raw[name] / slope)
         return found
 
@@ -484,11 +485,11 @@ class Parameters(_ParameterArrays):
         chosen = dict(self.chosen)
         for name in values.keys() - raw.keys():
             chosen[name] = _to_stored_setting(self.choices[name], values[name])
-        return self._with({**self.raw, **raw}, tuple(chosen.items()), self.followed)
+        return self._with({**self.raw, **raw}, tuple(chosen.items()), self.added_derivatives)
 
     def with_raw(self: T, raw: Mapping[str, Array]) -> T:
         """Return a copy with some of the unconstrained numbers replaced."""
-        return self._with({**self.raw, **raw}, self.chosen, self.followed)
+        return self._with({**self.raw, **raw}, self.chosen, self.added_derivatives)
 
     def with_derivatives(self: T, *names: str) -> T:
         """Return a copy that has derivatives for numbers that act when data are prepared.
@@ -496,16 +497,19 @@ class Parameters(_ParameterArrays):
         They are valid only near the prepared value: use them for inspection, not for descent.
         """
         _refuse_unknown(dict.fromkeys(names), self.numbers)
-        return self._with(self.raw, self.chosen, self.followed | set(names))
+        return self._with(self.raw, self.chosen, self.added_derivatives | set(names))
 
     def _with(
         self: T,
         raw: dict[str, Array],
         chosen: tuple[tuple[str, str | bool | int], ...],
-        followed: frozenset[str],
+        added_derivatives: frozenset[str],
     ) -> T:
         new = object.__new__(type(self))
-        fields = {"raw": raw, "chosen": chosen, "followed": followed, "point": self.point}
+        fields = {
+            "raw": raw, "chosen": chosen, "added_derivatives": added_derivatives,
+            "homogeneous": self.homogeneous,
+        }  # fmt: skip
         for name, value in fields.items():
             object.__setattr__(new, name, value)
         return new

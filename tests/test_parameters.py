@@ -72,7 +72,7 @@ def test_derivatives_stop_at_what_is_prepared():
 def test_dataclasses_replace_is_the_method():
     params = Given(sigma=2.0).with_derivatives("late")
     changed = dataclasses.replace(params, offset=3.0, cells=5)
-    assert type(changed) is Given and changed.followed == {"late"}
+    assert type(changed) is Given and changed.added_derivatives == {"late"}
     assert changed.values() == Given(sigma=2.0, offset=3.0, cells=5).values()
     assert jax.tree.structure(changed) == jax.tree.structure(params.replace(cells=5))
     with pytest.raises(InputError, match="no parameter 'sigmas'; did you mean 'sigma'"):

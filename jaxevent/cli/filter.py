@@ -109,7 +109,7 @@ def run(
         steps.append(("downsample", lambda r: events.downsample(r, downsample or 1, period or 0)))
     if not steps:
         raise InputError(
-            f"{source}: nothing was asked to be left out; name a step, for example --hot-pixels, "
+            f"{source}: no filter is given; name a step, for example --hot-pixels, "
             "or use jaxevent convert"
         )
     counts = [("events", len(recording.events))]

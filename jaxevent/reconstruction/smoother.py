@@ -682,7 +682,7 @@ class Smoother(KernelEstimator[AnyParams]):
     """The asynchronous Kalman smoother."""
 
     has_likelihood: ClassVar[bool] = True
-    has_unseen_errors: ClassVar[bool] = True  # whether the variance is that of `image_variance`
+    adds_unseen_errors: ClassVar[bool] = True  # variances are by `image_variance`
     kernel_video: ClassVar[Any] = SmootherVideo  # class of the kernel of a video
     kernel_images: ClassVar[Any] = SmootherImages  # class of the kernel of images at given times
     options: frozenset[str] = dataclasses.field(
@@ -815,7 +815,7 @@ class Smoother(KernelEstimator[AnyParams]):
         info = jax.tree.map(lambda v: v[f], trajectory.info)
         state = smoothed_state(m, precision, later)
         images = self.readout(params, state, info, here)
-        if not self.has_unseen_errors:
+        if not self.adds_unseen_errors:
             return images
         past, following = jax.tree.map(
             lambda v: jnp.where(behind, 0, v[f]), (trajectory.past, trajectory.future)
@@ -905,7 +905,7 @@ class Smoother(KernelEstimator[AnyParams]):
             S, q = predict_change(known[0], on, off, elapsed - lag(known))
             state = smoothed_state(past.m + S, 1 / (past.P + q), message.propagate_back(*left))
             image = self.readout(known[0], state, info, here)
-            if self.has_unseen_errors:
+            if self.adds_unseen_errors:
                 total = jnp.where(seconds > 0, moved_on, on), jnp.where(seconds > 0, moved_off, off)
                 span = elapsed - lag(known), rest
                 gap = gap_evidence(known[0], past, message, total, span)
@@ -918,7 +918,7 @@ class Smoother(KernelEstimator[AnyParams]):
             zero = jnp.zeros_like(later.h)
             state = smoothed_state(zero, zero, first.propagate_back(*left))
             image = self.readout(known[0], state, info, zero > 0)
-            if self.has_unseen_errors:
+            if self.adds_unseen_errors:
                 total = counted(known[0], **counts)
                 none = Gaussian(zero, zero), Message(zero, zero)
                 gap = gap_evidence(known[0], *none, total, (seconds + lag(known), zero))

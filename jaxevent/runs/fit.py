@@ -97,8 +97,8 @@ from jaxevent.tuning import FitResult, Run, optimise
 CHECKPOINT_FILE = "checkpoint"  # the name of the file in the folder
 RESULT_FILES = ("params.toml", "results.json", "results.md", "loss.csv", "loss.png", "config.toml")
 DIVERGED_WARNING = (
-    "{}: the steps led away, to a greater loss than at the start or to none; the parameters are "
-    "the best that were seen, so lower learning_rate or start elsewhere"
+    "{}: the fit diverged, to a greater loss than at the start or none that is finite; the "
+    "parameters are the best that were seen, so lower learning_rate or start elsewhere"
 )
 CHECKPOINT_PERIOD_S = 2.0  # s between checkpoints
 

@@ -249,8 +249,8 @@ def prepare_gyro_reference(
         bias = fit_gyro_bias(estimate, measured)
         source = "the gyro without its bias"
         notes.append(
-            f"a constant of {', '.join(f'{v:+.3f}' for v in bias)} rad/s was taken off the gyro: "
-            "its bias, or the estimate's, which --still S,S tells apart"
+            f"a constant of {', '.join(f'{v:+.3f}' for v in bias)} rad/s was subtracted from the "
+            "gyro: its bias, or the estimate's; --still S,S distinguishes them"
         )
         truth = dataclasses.replace(truth, values=truth.values - bias)
     return ReferenceMotion(truth, source, tuple(notes))
@@ -467,7 +467,7 @@ class WrittenMotion:
                     )
         if self.outliers is not None:
             lines.append(
-                f"{self.outliers:.1f} % of the events have no predecessor that it explains"
+                f"{self.outliers:.1f} % of the events have no predecessor on the motion's path"
             )
         if self.errors is not None:
             lines += ["", *self.errors.table()]

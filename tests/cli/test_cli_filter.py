@@ -44,7 +44,7 @@ def test_steps_are_those_of_the_library_in_the_order_of_the_help(stored, tmp_pat
 
 def test_what_cannot_be_filtered(stored, tmp_path, capsys):
     source, target = tmp_path / "r.h5", tmp_path / "out.h5"
-    fails(capsys, ["filter", source, target], source, "nothing was asked", "--hot-pixels")
+    fails(capsys, ["filter", source, target], source, "no filter is given", "--hot-pixels")
     fails(capsys, ["filter", source, target, "--crop", 0, 0, 500, 2], "500x2", "not inside")
     fails(capsys, ["filter", source, target, "--background", 0], "is 0 us")
     fails(capsys, ["filter", source, target, "--start", 90], source, "no event")

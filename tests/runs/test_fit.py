@@ -759,7 +759,7 @@ def test_a_fit_that_diverges_says_so(folder, capsys):
     for again in ([], ["--resume"]):
         assert cli.main(["fit", str(config), "--out", str(out), *again]) == 2
         said = capsys.readouterr()
-        assert said.err.count("\n") == 1 and "edi: the steps led away" in said.err
+        assert said.err.count("\n") == 1 and "edi: the fit diverged" in said.err
         assert "| edi, before" in said.out
     jaxevent.METHODS["edi"].Params.load(out / "params.toml", "edi")
     rows = json.loads((out / "results.json").read_text())["rows"]

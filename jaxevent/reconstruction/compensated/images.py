@@ -68,7 +68,7 @@ class InstantSmoother(Smoother[Params]):
     (sigma_pixel / (I + I0))^2 + 1e-4, and is deblurred as far as events determine it.
     """
 
-    has_unseen_errors: ClassVar[bool] = False  # the fusion has a variance of its own
+    adds_unseen_errors: ClassVar[bool] = False  # the fusion estimates its own variance
 
     def readout_inputs(
         self, params: Params, frames: FrameFeatures, measured: FrameMeasurements, events: Any

@@ -410,7 +410,7 @@ class ImageKernel(abc.ABC):
         numbers = [
             (leaf, k)
             for leaf, (path, value) in enumerate(jax.tree_util.tree_flatten_with_path(params)[0])
-            if getattr(path[-1], "key", "point") not in {"point", *dead}
+            if getattr(path[-1], "key", "homogeneous") not in {"homogeneous", *dead}
             for k in range(np.size(value))
         ]
         self.check(params, DerivativeDirections(tuple(numbers), ("mean", "variance")))
@@ -605,7 +605,9 @@ class KernelImages(eqx.Module):
     def __call__(self, params: Any, *, variance: bool = True) -> Estimate:
         outputs = ("mean", "variance") if variance else ("mean",)
         # No image depends on `point`: without a tangent of it the kernel carries none.
-        params = eqx.tree_at(lambda p: p.point, params, jax.lax.stop_gradient(params.point))
+        params = eqx.tree_at(
+            lambda p: p.homogeneous, params, jax.lax.stop_gradient(params.homogeneous)
+        )
         mean, P, valid = _images((self.kernel, outputs), self.number, self.rows, params)
         return Estimate(mean, P, valid)
 
@@ -656,7 +658,7 @@ def make_kernel_images(
     """
     serves = _is_single_precision()
     backend = choose_backend(compiler, serves)
-    if backend == "xla" or "rho_ref" in params.followed:
+    if backend == "xla" or "rho_ref" in params.added_derivatives:
         return None
     if not programs_may_call(method.name, compiler):
         return None

@@ -611,7 +611,7 @@ class SmootherPasses:
         self.clock, self.layout = recording.windows.clock, recording.layout
         stride = self.layout.stride
         self.kind = KernelKind(self.clock.exposed, self.dtype, stride, directions)
-        fixed = recording.fixed_inputs(frame_delay, method.has_unseen_errors)
+        fixed = recording.fixed_inputs(frame_delay, method.adds_unseen_errors)
         self._fixed = {name: value for name, value in fixed.items() if name != "present"}
         self._program: SmootherProgram | None = None
         self.spare: queue.SimpleQueue[NDArray] = queue.SimpleQueue()  # memory for bands

@@ -81,7 +81,7 @@ UNIFORM_INPUTS = {
 class SmoothingMethod(ImageMethod, Protocol):
     """A method that a kernel is made of; see `smoother.Smoother`."""
 
-    has_unseen_errors: ClassVar[bool]
+    adds_unseen_errors: ClassVar[bool]
 
     def pixel_state_spec(self, number: Any) -> dict[str, Any]: ...
 
