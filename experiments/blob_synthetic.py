@@ -118,6 +118,7 @@ def track_errors(states: TrackStates, true: np.ndarray, times: np.ndarray) -> di
 def settling_time(tracks: Tracks, truth: BlobTruth) -> float:
     """ms until both sizes are within 20 % of the truth and stay so for 2 ms."""
     times = np.concatenate([np.arange(0, 6_000, 100), np.arange(6_000, 30_000, 500)])
+    times = times[times >= tracks.start]
     true = truth(times)[:, 0, 4:6]
     off = np.any(abs(tracks(times).mean[:, 0, 4:6] / true - 1) > 0.2, axis=1)
     for at in times[:-4]:

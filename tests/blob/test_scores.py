@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+from scripts import FOLDER, script
 
+from jaxevent.blob import constant_velocity
 from jaxevent.blob.scores import HOTA_THRESHOLDS, score_tracks
 from jaxevent.errors import InputError
+from jaxevent.simulate import blob_scene
 
 T = 10
 
@@ -101,3 +104,13 @@ def test_nothing():
     assert scored([path(0)], []).hota == scored([], [path(0)]).hota == 0
     with pytest.raises(InputError, match="do not fit"):
         score_tracks(np.zeros((3, 1, 2)), np.zeros((4, 1, 2)), 1.0)
+
+
+def test_settling_begins_with_the_recording(monkeypatch):
+    """The first event is later than time 0, which no track can be asked for."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+    recording, truth = blob_scene("walk", duration=0.05)
+    assert recording.start > 0
+    seeds = [(*truth(0.0)[0, 0, :2], 8.0)]
+    tracks = constant_velocity.estimate(recording, seeds=seeds, start=0.0, smooth=False)
+    assert script("blob_synthetic").settling_time(tracks, truth) == np.inf  # it has no sizes
