@@ -10,7 +10,8 @@ event of a burst is late, so with the latest events alone every motion would be 
 """
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -71,6 +72,15 @@ class Candidates(eqx.Module):
     def mask(self) -> Bool[Numeric, "*batches K C"]:
         """Return which entries hold a candidate."""
         return self.age > 0
+
+    @property
+    def most_used(self) -> int:
+        """Largest number of candidates of an event."""
+        return int(np.asarray(self.mask.sum(-1)).max(initial=0))
+
+    def shorten(self, most: int) -> "Candidates":
+        """Return the candidates without the entries beyond a number, which none may fill."""
+        return dataclasses.replace(self, d=self.d[..., :most, :], age=self.age[..., :most])
 
 
 class CandidateBatches(NamedTuple):
@@ -173,6 +183,47 @@ class CandidateSampler:
         """Row of the first event that has not been sampled."""
         return self._row
 
+    @property
+    def next_time(self) -> int:
+        """Time of the first event that has not been sampled, us; that of the last if all have."""
+        row = min(self._row, len(self.recording.events) - 1)
+        return int(self.recording.events[row : row + 1].t[0]) if row >= 0 else self._last
+
+    def skip(self, until: int) -> None:
+        """Make candidates of the next events up to a time, but score none of them.
+
+        Args:
+            until: The time, us, of the first event that may be scored.
+        """
+        never = np.array([[[1]], [[0]]]), np.array([0, 0, np.inf])[:, None, None]
+        rules = BatchRules(
+            *never, 0.0, -NEVER_US, self.longest, -NEVER_US, self.radius, self.silence
+        )
+        stop = self.recording.events.index(until)
+        while self._row < stop:
+            events = self.recording.events[self._row : min(self._row + EVENTS_PER_READ, stop)]
+            stream = EventStream(events.t, events.x, events.y, events.p, 1)
+            out, cursor = self._make_arrays(1), np.array([0, 0, 0, -NEVER_US])
+            _fill_batches(stream, rules, self._recent, out, cursor, self._clock)
+            self._row += len(events)
+            self._last = int(events.t[-1])
+
+    def _make_arrays(self, batches: int) -> "CandidateArrays":
+        """Make the arrays of some batches, empty."""
+        real, shape = np.dtype(jnp.result_type(float)), (batches, self.batch)
+        return CandidateArrays(
+            d=np.zeros((*shape, self.most, 2), real),
+            age=np.zeros((*shape, self.most), real),
+            xi=np.zeros((*shape, 2), real),
+            bounds=np.zeros((*shape, 2, 2), real),
+            scale=np.ones(shape, real),
+            rate=np.zeros(shape, real),
+            valid=np.zeros(shape, bool),
+            row=np.full(shape, -1),
+            t=np.zeros(batches, np.int64),
+            history=np.zeros(batches, real),
+        )
+
     def sample(
         self,
         batches: int,
@@ -195,20 +246,7 @@ class CandidateSampler:
         Returns:
             The batches, always of the same shape.
         """
-        real = np.dtype(jnp.result_type(float))
-        shape = batches, self.batch
-        out = CandidateArrays(
-            d=np.zeros((*shape, self.most, 2), real),
-            age=np.zeros((*shape, self.most), real),
-            xi=np.zeros((*shape, 2), real),
-            bounds=np.zeros((*shape, 2, 2), real),
-            scale=np.ones(shape, real),
-            rate=np.zeros(shape, real),
-            valid=np.zeros(shape, bool),
-            row=np.full(shape, -1),
-            t=np.zeros(batches, np.int64),
-            history=np.zeros(batches, real),
-        )
+        real, out = np.dtype(jnp.result_type(float)), self._make_arrays(batches)
         young, old = np.broadcast_arrays(np.atleast_2d(youngest), np.atleast_2d(oldest))
         # Single precision may fall short of a whole number of microseconds.
         young, old = 1e6 * (1 - 1e-6) * young, 1e6 * (1 + 1e-6) * old
@@ -257,14 +295,29 @@ class CandidateSampler:
         parts: list[CandidateBatches] = []
         while not parts or not self.is_exhausted:
             parts.append(self.sample(64, youngest, oldest))
-        used = max(1, sum(int((part.row >= 0).any(-1).sum()) for part in parts))
-        names = {field.name for field in dataclasses.fields(Candidates)} - {"radius"}
-        fields = {
-            name: np.concatenate([getattr(part.candidates, name) for part in parts])[:used]
-            for name in names
-        }
-        t, row = (np.concatenate([getattr(part, name) for part in parts]) for name in ("t", "row"))
-        return CandidateBatches(Candidates(**fields, radius=self.radius), t[:used], row[:used])
+        return join_batches(parts)
+
+
+def join_batches(parts: Sequence[CandidateBatches]) -> CandidateBatches:
+    """Join the batches of several calls of `CandidateSampler.sample`, at least one.
+
+    Args:
+        parts: The batches, in the order of the calls.
+
+    Returns:
+        All of them, without empty ones at the ends of the parts.
+    """
+    used = [int((part.row >= 0).any(-1).sum()) for part in parts]
+    used[0] = max(1, used[0])
+
+    def join(arrays: Iterable[Any]) -> NDArray:
+        return np.concatenate([array[:n] for array, n in zip(arrays, used, strict=True)])
+
+    names = {field.name for field in dataclasses.fields(Candidates)} - {"radius"}
+    fields = {name: join(getattr(part.candidates, name) for part in parts) for name in names}
+    candidates = Candidates(**fields, radius=parts[0].candidates.radius)
+    t, row = (join(getattr(part, name) for part in parts) for name in ("t", "row"))
+    return CandidateBatches(candidates, t, row)
 
 
 class EventStream(NamedTuple):

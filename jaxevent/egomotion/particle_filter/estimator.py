@@ -16,7 +16,13 @@ from jaxevent import threads
 from jaxevent.camera import PinholeCamera
 from jaxevent.codegen.module import make_kernel
 from jaxevent.deprecated import renamed_methods
-from jaxevent.egomotion.candidates import Candidates, CandidateSampler, ExpectedFlow
+from jaxevent.egomotion.candidates import (
+    CandidateBatches,
+    Candidates,
+    CandidateSampler,
+    ExpectedFlow,
+    join_batches,
+)
 from jaxevent.egomotion.estimator import (
     COMMON_OPTIONS,
     MotionEstimator,
@@ -365,6 +371,7 @@ class VotingEstimator(MotionEstimator[Params]):
         # to one shape, so that one program serves all; random numbers stay the same.
         sampled = [self._sample_segment(segment, params, model) for segment in segments]
         most = max((len(candidates.elapsed) for _, candidates, _ in sampled), default=0)
+        most_candidates = max((candidates.most_used for _, candidates, _ in sampled), default=0)
         real = np.dtype(jnp.result_type(float))
         prepared: list[TrainingRuns] = []
         for number, (segment, (kind, candidates, t)) in enumerate(
@@ -393,7 +400,7 @@ class VotingEstimator(MotionEstimator[Params]):
                     pad(counted).astype(real),
                     np.asarray(max(counted.sum(), 1e-9), real),
                     kind,
-                    jax.tree.map(pad, candidates),
+                    jax.tree.map(pad, candidates.shorten(most_candidates)),
                     noise,
                     start,
                 )
@@ -403,19 +410,41 @@ class VotingEstimator(MotionEstimator[Params]):
     def _sample_segment(
         self, segment: TrainingSegment, params: Params, model: type[Model]
     ) -> tuple[Model, Candidates, NDArray[np.int64]]:
-        """Sample the candidates that half to double the true speeds need."""
-        kind, sampler = self.sampler(segment.crop(), params, model)
-        youngest, oldest = 0.0, float(params.tau_max)
-        if params.likelihood != "literal" and not model.half_line:
-            times = np.linspace(segment.start, segment.stop, 32).astype(np.int64)
-            times = times[segment.known.covers(times)]
-            xi = sampler.xi[:: max(1, len(sampler.xi) // 8), ::16].reshape(-1, 2)
-            basis = np.asarray(kind.basis(jnp.asarray(xi)))
-            speed = np.linalg.norm(np.einsum("kid,td->kti", basis, segment.known(times)), axis=-1)
-            b = float(params.baseline)
-            youngest = min(b / max(speed.max(), 1e-9), oldest) / 4
-            oldest = min(2 * b / max(speed.min(), 1e-9), oldest)
-        whole = sampler.sample_all(youngest, oldest)
+        """Sample the candidates that motions near the true one need, chunk by chunk as `estimate`.
+
+        Batches begin when events have come for the largest age of candidates, be they earlier than
+        the segment. Where that is too late, and for the literal likelihood, they begin at once.
+
+        Args:
+            segment: The segment.
+            params: The parameters.
+            model: Motion model.
+
+        Returns:
+            The model, the candidates, and the times of their batches, us.
+        """
+
+        def find_range(us: int) -> CandidateRange:
+            truth = segment.known(np.clip([us], segment.known.t[0], segment.known.t[-1]))[0]
+            near = MotionRange(truth, _training_spread(kind, truth))
+            return candidate_range(params, kind, corners, near)
+
+        recording, start, stop = segment.recording, segment.start, segment.stop
+        kind, sampler = self.sampler(recording[start:stop], params, model)
+        corners = _basis_at_corners(kind, sampler)
+        first, lead = recording.event_span()[0], 0
+        if params.likelihood != "literal":
+            lead = round(1e6 * float(np.max(find_range(start).oldest)))
+        begin = max(start, first + lead)
+        if begin < stop and lead:
+            kind, sampler = self.sampler(recording[begin - lead : stop], params, model)
+            sampler.skip(begin)
+        batches, span = _chunk_size(params)
+        parts: list[CandidateBatches] = []
+        while not parts or not sampler.is_exhausted:
+            ages = find_range(sampler.next_time)
+            parts.append(sampler.sample(batches, ages.youngest, ages.oldest, span, ages.expected))
+        whole = join_batches(parts)
         return kind, whole.candidates, whole.t
 
 
@@ -445,8 +474,7 @@ class ChunkRunner:
     ):
         self.params, self.model, self.sampler, self.lock = params, model, sampler, lock
         self.camera = camera
-        self.batches = -(-EVENTS_PER_CHUNK // params.batch)
-        self.span = MAX_CHUNK_TAUS * float(params.tau_max)  # s
+        self.batches, self.span = _chunk_size(params)
         self.row = 0  # after the last event that was scored
         self._run = kernel or functools.partial(_run, params, model)
         self._key, self._corners = jax.random.key(seed), _basis_at_corners(model, sampler)
@@ -553,7 +581,8 @@ class ChunkRunner:
         noise = _draw(key, self.batches, self.params, self.model)
         if self._state is None:
             self._state = _init(self.params, self.model, noise)
-        ages = candidate_range(self.params, self.model, self._corners, self._state)
+        near = MotionRange.of(self._state)
+        ages = candidate_range(self.params, self.model, self._corners, near)
         sample = self.sampler.sample(
             self.batches, ages.youngest, ages.oldest, self.span, ages.expected
         )
@@ -606,15 +635,24 @@ class WarmStartedRuns(TrainingRuns):
         """
         first, normal = jnp.asarray(self.truth)[0], jnp.asarray(self.start)
         particles = []
+        spread = _training_spread(self.model, first)
         for part in self.model.parts:
-            middle, normal_part = first[part.rows], normal[:, part.rows]
-            near = middle + RELATIVE_TRAINING_SPREAD * jnp.sqrt((middle**2).mean()) * normal_part
+            near = first[part.rows] + spread[part.rows] * normal[:, part.rows]
             if part.direction:
                 near = near / length(near)[:, None]
             particles.append(near)
         state = filtering.init_near(params, jnp.concatenate(particles, 1))
         _, info = filtering.run(params, self.model, self.candidates, noise, state)
         return info.mean, info.lag
+
+
+def _training_spread(model: Model, motion: Any) -> Any:
+    """Return the standard deviations (d,) of the first particles of a fit around a motion (d,)."""
+    out = jnp.zeros_like(motion)
+    for part in model.parts:
+        size = jnp.sqrt((motion[part.rows] ** 2).mean())
+        out = out.at[part.rows].set(RELATIVE_TRAINING_SPREAD * size)
+    return out
 
 
 def calibrate(
@@ -745,6 +783,32 @@ def adapt_lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:
     return chosen
 
 
+class MotionRange(NamedTuple):
+    """A motion, and how far particles are from it.
+
+    Attributes:
+        mean: (d,) the motion, in the units of the model.
+        spread: (d,) standard deviation of each component.
+    """
+
+    mean: NDArray[np.floating]
+    spread: NDArray[np.floating]
+
+    @classmethod
+    def of(cls, state: ParticleState | None) -> "MotionRange | None":
+        """Return that of a filter's particles, or None in a search."""
+        if state is None or bool(state.searching):
+            return None
+        particles, weights = np.asarray(state.particles), np.exp(np.asarray(state.log_weights))
+        mean = weights @ particles
+        return cls(mean, np.sqrt(weights @ (particles - mean) ** 2))
+
+
+def _chunk_size(params: Params) -> tuple[int, float]:
+    """Return batches of a chunk, and its longest duration, s."""
+    return -(-EVENTS_PER_CHUNK // params.batch), MAX_CHUNK_TAUS * float(params.tau_max)
+
+
 class CandidateRange(NamedTuple):
     """Candidates that the next batches can need; see `CandidateSampler.sample`."""
 
@@ -754,17 +818,17 @@ class CandidateRange(NamedTuple):
 
 
 def candidate_range(
-    params: Params, model: Model, corners: NDArray, state: ParticleState | None
+    params: Params, model: Model, corners: NDArray, near: MotionRange | None
 ) -> CandidateRange:
-    """Return the candidates near the flow of the mean, by parts of the sensor.
+    """Return the candidates near the flow of a motion, by parts of the sensor.
 
-    In a search, without a state and for the literal likelihood, all candidates are in the range.
+    In a search and for the literal likelihood all candidates are in the range.
 
     Args:
         params: The parameters.
         model: Motion model.
         corners: Basis at the corners of parts of the sensor, see `_basis_at_corners`.
-        state: The state, or None.
+        near: The motion; None in a search.
 
     Returns:
         The range.
@@ -775,14 +839,12 @@ def candidate_range(
     if model.half_line:
         tau = float(params.tau_general)
         return CandidateRange(youngest * tau, tau, None)
-    if params.likelihood == "band" or state is None or bool(state.searching):
+    if params.likelihood == "band" or near is None:
         widest = np.full(model.dimension, float(model.search_bound(params)))
         fastest = float(np.sqrt(((np.abs(corners) @ widest) ** 2).sum(-1)).max())
         return CandidateRange(youngest * min(b / fastest, tau_max / 2), tau_max, None)
-    particles, weights = np.asarray(state.particles), np.exp(np.asarray(state.log_weights))
-    mean = weights @ particles
-    spread = np.sqrt(weights @ (particles - mean) ** 2)
-    U, flow_sigma = corners @ mean, np.sqrt(((corners**2) @ spread**2).sum(-1)).max()
+    U = corners @ near.mean
+    flow_sigma = np.sqrt(((corners**2) @ near.spread**2).sum(-1)).max()
     four = np.stack([U[:-1, :-1], U[1:, :-1], U[:-1, 1:], U[1:, 1:]])
     # All flows of a part are about within a circle that holds those of its corners.
     centre = four.mean(0)
