@@ -419,6 +419,22 @@ def are_zero_tangents(tangents: Any) -> bool:
     return all(map(is_zero_tangent, jax.tree.leaves(tangents, is_leaf=is_zero_tangent)))
 
 
+def moving_numbers(tangents: Any) -> tuple[tuple[tuple[int, int], ...], list[Any]]:
+    """Find the numbers of parameters by which a rule with `symbolic_zeros` is to differentiate.
+
+    Args:
+        tangents: Tangents of the parameters.
+
+    Returns:
+        Leaf and place in it of each number, as in `DerivativeDirections`, and the tangents of these
+        leaves.
+    """
+    changes = jax.tree.leaves(tangents, is_leaf=is_zero_tangent)
+    moving = [k for k, change in enumerate(changes) if not is_zero_tangent(change)]
+    numbers = tuple((k, place) for k in moving for place in range(changes[k].size))
+    return numbers, [changes[k] for k in moving]
+
+
 def zero_tangents(tree: Any) -> Any:
     """Return tangents of 0 for all arrays of a tree."""
 

@@ -8,6 +8,7 @@ import pytest
 from points import HEIGHT, WIDTH, moved, recorded, turning
 
 from jaxevent.camera import PinholeCamera
+from jaxevent.codegen.derivative import DerivativeDirections
 from jaxevent.egomotion import voting
 from jaxevent.egomotion.particle_filter import filtering
 from jaxevent.egomotion.particle_filter.engine import CompiledFilter
@@ -99,3 +100,37 @@ def test_numba_without_a_kernel_is_refused():
         voting.estimate(recording, params, compiler="numba")
     with pytest.raises(InputError, match="no compiler 'gcc'"):
         voting.estimate(recording, params, compiler="gcc")
+
+
+def slopes_by_run(names, params, kind, c, noise, state):
+    """Derivatives (numbers, batches, d) of the mean by raw values, forwards, compiled by XLA."""
+    raw = {name: params.raw[name] for name in names}
+
+    def means(raw):
+        return filtering.run(params.with_raw(raw), kind, c, noise, state)[1].mean
+
+    found = jax.jit(jax.jacfwd(means))(raw)
+    return np.stack([np.asarray(found[name]) for name in names])
+
+
+def slopes_by_kernel(names, params, kind, c, noise, state):
+    """The same by a kernel, and its number of batches with nodes."""
+    leaves = [id(leaf) for leaf in jax.tree.leaves(params)]
+    numbers = tuple((leaves.index(id(params.raw[name])), 0) for name in names)
+    kernel = CompiledFilter(params, kind, DerivativeDirections(numbers))
+    out = kernel.run(c, noise, state).out
+    slopes = out.mean_tangents.reshape(len(out.mean), len(names), -1)
+    return np.moveaxis(slopes, 1, 0), out.mean, kernel.n_interpolated
+
+
+@pytest.mark.parametrize("model", ["planar", "rotation", "general"])
+def test_slopes_of_the_kernel_are_those_of_run(model):
+    """In searches, while motions are tracked, and where they are lost."""
+    names = "sigma_x", "alpha", "noise" if model == "planar" else "noise_rotation"
+    about = prepared(model)
+    slopes, mean, _ = slopes_by_kernel(names, *about)
+    expected = slopes_by_run(names, *about)
+    np.testing.assert_allclose(mean, RUN(*about)[1].mean, rtol=1e-7, atol=1e-8)
+    for name, got, one in zip(names, slopes, expected, strict=True):
+        assert np.abs(one).max() > 0.01
+        np.testing.assert_allclose(got, one, rtol=1e-6, atol=1e-6 * np.abs(one).max(), err_msg=name)

@@ -11,13 +11,15 @@ between these.
 
 import copy
 import dataclasses
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.codegen.derivative import DerivativeDirections
 from jaxevent.codegen.graph import Graph, Level, Node, ParameterProgram, TranslationError
 from jaxevent.codegen.module import KernelCache
 from jaxevent.codegen.trace import (
@@ -66,8 +68,9 @@ def {name}(cells, work, numbers, d, ages, chosen, count, first, most):
 {init}
     if cells[{counts}] == 0:
         return
-    for i in range(count * {BLOCK}):
-        work[{votes_row} + i] = REAL(0)
+    for row in ({votes_rows}):
+        for i in range(count * {BLOCK}):
+            work[row + i] = REAL(0)
     size = {size}
     for begin in range(0, count, size):
         end = begin + size
@@ -124,10 +127,27 @@ class Layout:
             stores[name] = f"cells[{at}] = {value}"
         return stores
 
-    def rows_of(self, name: str) -> NDArray[np.int64]:
-        """Return the rows of an array of all particles."""
-        found = {n: row for n, row in self.rows.items() if n.rpartition(".")[0] == name}
-        return np.array([found[f"{name}.{k}"] for k in range(len(found))], np.int64)
+    def rows_of(self, *names: str) -> NDArray[np.int64]:
+        """Return the rows of arrays of all particles, one array behind the other."""
+        return _list_places(self.rows, names)
+
+    def cells_of(self, *names: str) -> NDArray[np.int64]:
+        """Return the cells of arrays, one array behind the other."""
+        return _list_places(self.cells, names)
+
+
+def _list_places(places: dict[str, int], names: Sequence[str]) -> NDArray[np.int64]:
+    """Return the places of all numbers of some arrays, "name.0" and on.
+
+    Args:
+        places: Places by the names of numbers.
+        names: Names of arrays; those that are not there have no numbers.
+
+    Returns:
+        (numbers,) places.
+    """
+    numbers = (f"{name}.{k}" for name in names for k in range(len(places)))
+    return np.array([places[number] for number in numbers if number in places], np.int64)
 
 
 def _with_focal_length(model: Model, f: Any) -> Model:
@@ -145,13 +165,28 @@ def _with_focal_length(model: Model, f: Any) -> Model:
     return model
 
 
+def tangent_name(key: str, field: str | None = None) -> str:
+    """Return the name of the derivatives of a tree, or of a field of it.
+
+    Args:
+        key: Name of the tree.
+        field: Name of the field.
+
+    Returns:
+        The name.
+    """
+    return f"{key}.tangent" if field is None else f"{key}.{field}.tangent"
+
+
 class FunctionTracer:
     """Tracer of functions, with the positions of their inputs and results."""
 
-    def __init__(self, params: Params, model: Model, dtype: np.dtype):
-        self.params, self.model, self.dtype = params, model, dtype
+    def __init__(
+        self, params: Params, model: Model, dtype: np.dtype, directions: DerivativeDirections
+    ):
+        self.params, self.model, self.dtype, self.directions = params, model, dtype, directions
         self.graph, self.host = Graph(), ParameterProgram()
-        for leaf in jax.tree.leaves(params):
+        for leaf in jax.tree.leaves(directions.inputs(params, ())):
             self.host.add_input(np.asarray(leaf))
         self.cells = {name: at for at, name in enumerate(CELL_NAMES)}
         self.rows: dict[str, int] = {}
@@ -164,33 +199,133 @@ class FunctionTracer:
         return jax.ShapeDtypeStruct(size, self.dtype if kind is None else kind)
 
     def add(
-        self, name: str, function: Any, inputs: dict[str, Any], alias: bool = False
+        self,
+        name: str,
+        function: Any,
+        inputs: dict[str, Any],
+        *,
+        alias: bool = False,
+        moving: Mapping[str, Sequence[str]] | None = None,
+        moved: Mapping[str, Sequence[str]] | None = None,
     ) -> dict[str, Any]:
         """Translate `function(params, model, **inputs)`, which returns a dict.
 
         A result that is equal for all particles becomes one number for the functions that read it.
+        With directions the function is translated with its derivatives: those of an input "S" are
+        "S.tangent", and those of the field of an input "state.particles.tangent".
 
         Args:
             name: Name of the function.
             function: The function.
             inputs: Trees of shapes.
             alias: Whether results that are inputs stay where these are.
+            moving: By name the fields of inputs that have derivatives; none: it has them itself.
+            moved: The same of results.
 
         Returns:
             Trees of shapes of the results, to be inputs of other functions.
         """
         inputs, trees = {**inputs, "f": self.f}, {}
+        of_inputs = self._tangent_names(moving, inputs)
+        given = dict(inputs)
+        for tangent, (key, field) in of_inputs.items():
+            leaf = inputs[key] if field is None else getattr(inputs[key], field)
+            given[tangent] = self.shape(len(self.directions.numbers), *leaf.shape)
 
-        def call(params: Any, f: Any, **inputs: Any) -> dict[str, Any]:
-            results = function(params, _with_focal_length(self.model, f), **inputs)
+        def compute(params: Any, f: Any, **values: Any) -> dict[str, Any]:
+            return function(params, _with_focal_length(self.model, f), **values)
+
+        def call(known: Any, **values: Any) -> dict[str, Any]:
+            if not self.directions.numbers:
+                results = compute(known[0], **values)
+            else:
+                results = self._differentiate(compute, known, values, of_inputs, moved or {})
             trees.update(jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape, v.dtype), results))
             return results
 
-        translated = translate_function(call, self.params, inputs, self.graph, self.host)
-        for key, tree in inputs.items():
+        known = self.directions.inputs(self.params, ())
+        translated = translate_function(call, known, given, self.graph, self.host)
+        for key, tree in given.items():
             self._lay_out(key, tree)
         self.functions[name] = translated
         return {key: self._lay_out(key, tree, translated, alias) for key, tree in trees.items()}
+
+    def _tangent_names(
+        self, fields: Mapping[str, Sequence[str]] | None, trees: Mapping[str, Any]
+    ) -> dict[str, tuple[str, str | None]]:
+        """Name the derivatives of trees' fields; there are none without directions.
+
+        Args:
+            fields: By a tree's name the fields that have derivatives; none: the tree itself has.
+            trees: The trees.
+
+        Returns:
+            For each name of a derivative the tree and the field, or None.
+        """
+        if not self.directions.numbers:
+            return {}
+        found: dict[str, tuple[str, str | None]] = {}
+        for key, names in (fields or {}).items():
+            for field in names or (None,):
+                if field is None or getattr(trees[key], field) is not None:
+                    found[tangent_name(key, field)] = (key, field)
+        return found
+
+    def _differentiate(
+        self,
+        function: Callable[..., dict[str, Any]],
+        known: Any,
+        values: dict[str, Any],
+        of_inputs: dict[str, tuple[str, str | None]],
+        moved: Mapping[str, Sequence[str]],
+    ) -> dict[str, Any]:
+        """Compute results, and the derivatives of some along all directions.
+
+        Args:
+            function: Function of the parameters and of named values.
+            known: Parameters, nothing, and the directions.
+            values: The values, with the derivatives of some.
+            of_inputs: The derivatives among them, see `_tangent_names`.
+            moved: Fields of results that have derivatives.
+
+        Returns:
+            The results, with derivatives.
+        """
+        params, _, seeds = known
+        plain = {key: value for key, value in values.items() if key not in of_inputs}
+        at = {
+            name: plain[key] if field is None else getattr(plain[key], field)
+            for name, (key, field) in of_inputs.items()
+        }
+        # What is equal for all particles has derivatives that are.
+        changes = {
+            name: jnp.broadcast_to(
+                values[name].reshape(values[name].shape + (1,) * (v.ndim + 1 - values[name].ndim)),
+                (len(self.directions.numbers), *v.shape),
+            )
+            for name, v in at.items()
+        }
+
+        def compute(params: Any, at: dict[str, Any]) -> tuple[Any, Any]:
+            given = dict(plain)
+            for name, (key, field) in of_inputs.items():
+                given[key] = (
+                    at[name]
+                    if field is None
+                    else dataclasses.replace(given[key], **{field: at[name]})
+                )
+            made = function(params, **given)
+            names = self._tangent_names(moved, made)
+            return {
+                name: made[key] if field is None else getattr(made[key], field)
+                for name, (key, field) in names.items()
+            }, made
+
+        def push(seeds: Any, changes: Any) -> Any:
+            return jax.jvp(compute, (params, at), (seeds, changes), has_aux=True)[1:]
+
+        slopes, made = jax.vmap(push, out_axes=(0, None))(seeds, changes)
+        return made | slopes
 
     def _lay_out(
         self, key: str, tree: Any, translated: TracedFunction | None = None, alias: bool = False
@@ -234,13 +369,16 @@ class FunctionTracer:
         return self.graph.node("max", (node, node), node.kind, Level.ELEMENT)
 
 
-def program_of(params: Params, model: Model, dtype: np.dtype) -> TracedProgram:
+def program_of(
+    params: Params, model: Model, dtype: np.dtype, directions: DerivativeDirections
+) -> TracedProgram:
     """Translate the functions of the filter.
 
     Args:
         params: The parameters.
         model: Motion model.
         dtype: Type of real numbers.
+        directions: Numbers of the parameters by which the motion is differentiated.
 
     Returns:
         The program.
@@ -250,7 +388,7 @@ def program_of(params: Params, model: Model, dtype: np.dtype) -> TracedProgram:
     """
     if params.likelihood == "literal":
         raise TranslationError('likelihood = "literal"')
-    tracer = FunctionTracer(params, model, dtype)
+    tracer = FunctionTracer(params, model, dtype, directions)
     shape, d = tracer.shape, model.dimension
     cloud, each, flag = shape(ELEMENT_AXIS_LENGTH, d), shape(ELEMENT_AXIS_LENGTH), shape(kind=bool)
     # Classes that check their fields take shapes in a trace.
@@ -276,13 +414,21 @@ def program_of(params: Params, model: Model, dtype: np.dtype) -> TracedProgram:
         restarted, middle, widest = filtering.restart(params, model, cloud)
         return {"restarted": restarted, "middle": middle, "widest": widest}
 
-    tracer.add("predict", predict, {"state": state, "timing": timing, "normal": cloud})
+    tracer.add(
+        "predict",
+        predict,
+        {"state": state, "timing": timing, "normal": cloud},
+        moving={"state": ("particles", "log_weights")},
+        moved={"predicted": (), "weights": ()},
+    )
     for name, searching in (("track", False), ("search", True)):
         _add_event(tracer, name, searching, event, cloud, each)
     tracer.add(
         "reweight",
         reweight,
         {"state": state, "timing": timing, "predicted": cloud, "likelihood": of_batch},
+        moving={"state": ("log_weights",), "predicted": (), "likelihood": ("log_likelihood",)},
+        moved={"found": ("log_weights", "mean")},
     )
     tracer.add("restart", restart, {"cloud": cloud})
     row_size = MOTIONS_PER_BLOCK * -(-params.particles // MOTIONS_PER_BLOCK)
@@ -304,6 +450,7 @@ def _add_event(
         each: Shapes of their weights.
     """
     key, shape = f"{name}_votes", tracer.shape
+    expected = ("U", "line", "rate")  # what moves with the particles
 
     def init(params, model, event, motions, motion_weights):
         votes = likelihood.init_votes(params, model, event, motions, motion_weights, searching)
@@ -324,11 +471,32 @@ def _add_event(
         return {"total": total + found.log_likelihood, "votes": found.votes, "chance": found.chance}
 
     inputs = {"event": event, "motions": cloud, "motion_weights": each}
-    votes = {key: tracer.add(f"{name}_init", init, inputs, alias=True)[key]}
+    votes = {
+        key: tracer.add(
+            f"{name}_init",
+            init,
+            inputs,
+            alias=True,
+            moving={"motions": (), "motion_weights": ()},
+            moved={key: expected},
+        )[key]
+    }
     tracer.add(f"{name}_span", span, votes)
-    tracer.add(f"{name}_accumulate", accumulate, {"d": shape(2), "dt": shape(), "S": each, **votes})
+    tracer.add(
+        f"{name}_accumulate",
+        accumulate,
+        {"d": shape(2), "dt": shape(), "S": each, **votes},
+        moving={"S": (), key: expected},
+        moved={"S": ()},
+    )
     inputs = {"event": event, "S": each, "motion_weights": each, "radius": shape(), "total": each}
-    tracer.add(f"{name}_likelihood", finish, {**inputs, **votes})
+    tracer.add(
+        f"{name}_likelihood",
+        finish,
+        {**inputs, **votes},
+        moving={"S": (), "total": (), key: expected},
+        moved={"total": ()},
+    )
 
 
 def write(program: TracedProgram) -> ModuleText:
@@ -360,7 +528,9 @@ def write(program: TracedProgram) -> ModuleText:
                 span=body(f"{name}_span", 8),
                 accumulate=body(f"{name}_accumulate", 12),
                 likelihood=body(f"{name}_likelihood"),
-                votes_row=layout.rows["S.0"] * layout.row_size,
+                votes_rows="".join(
+                    f"{row * layout.row_size}, " for row in layout.rows_of("S", tangent_name("S"))
+                ),
                 dx=layout.cells["d.0"],
                 dy=layout.cells["d.1"],
                 **{key: at[key] for key in ("counts", "youngest", "oldest", "dt")},
@@ -371,6 +541,23 @@ def write(program: TracedProgram) -> ModuleText:
 
 
 _kernels = KernelCache(ModelFunctions, write, max_nodes=MAX_OPERATIONS)
+_tangent_kernels = KernelCache(ModelFunctions, write, max_nodes=4 * MAX_OPERATIONS)
+
+
+class FilterRun(NamedTuple):
+    """Results of a filter's kernel, on the host.
+
+    Attributes:
+        particles: (N, d) at the end.
+        log_weights: (N,) at the end.
+        cells: Single numbers of the state at the end, by name.
+        out: Reports of the batches.
+    """
+
+    particles: NDArray
+    log_weights: NDArray
+    cells: dict[str, Any]
+    out: InfoArrays
 
 
 class CompiledFilter:
@@ -379,45 +566,58 @@ class CompiledFilter:
     Args:
         params: The parameters.
         model: Motion model.
+        directions: Numbers of the parameters by which the mean motion is differentiated.
 
     Raises:
         TranslationError: There is no kernel.
     """
 
-    def __init__(self, params: Params, model: Model):
+    def __init__(
+        self,
+        params: Params,
+        model: Model,
+        directions: DerivativeDirections = DerivativeDirections(),  # noqa: B008
+    ):
         self.dtype = np.dtype(jnp.result_type(float))
         fields, kind = jax.tree.flatten(_with_focal_length(model, 1.0))
         if fields:
             raise TranslationError("numbers that the model holds")
-        key = kind, jax.tree.structure(params), self.dtype
-        kernel = _kernels.get(key, params, lambda: program_of(params, model, self.dtype))
+        count = len(directions.numbers)
+        key = kind, jax.tree.structure(params), self.dtype, count
+        kernels = _tangent_kernels if count else _kernels
+        kernel = kernels.get(
+            key,
+            directions.inputs(params, ()),
+            lambda: program_of(params, model, self.dtype, directions),
+        )
         self._functions, self._numbers = kernel.functions, kernel.numbers
         self._layout, self._count, self._model = kernel.places, params.particles, model
         of, rows, d = self._layout.rows_of, self._layout.rows, model.dimension
+
+        def with_tangents(*place: str) -> NDArray[np.int64]:
+            return of(".".join(place), tangent_name(*place))
+
         self._rows = RowIndices(
-            particles=of("state.particles"),
+            particles=with_tangents("state", "particles"),
             normal=of("normal"),
-            predicted=of("predicted"),
-            motions=of("motions"),
+            predicted=with_tangents("predicted"),
+            motions=with_tangents("motions"),
             cloud=of("cloud"),
             restarted=of("restarted"),
-            log_weights=rows["state.log_weights.0"],
-            weights=rows["weights.0"],
-            motion_weights=rows["motion_weights.0"],
-            total=rows["total.0"],
-            log_likelihood=rows["likelihood.log_likelihood.0"],
-            new_log_weights=rows["found.log_weights.0"],
+            log_weights=with_tangents("state", "log_weights"),
+            weights=with_tangents("weights"),
+            motion_weights=with_tangents("motion_weights"),
+            total=with_tangents("total"),
+            log_likelihood=with_tangents("likelihood", "log_likelihood"),
+            new_log_weights=with_tangents("found", "log_weights"),
             youngest=rows.get("search_votes.ages.youngest.0", -1),
-            mean=self._report_cells("found.mean", "found.covariance"),
-            widest=self._report_cells("middle", "widest"),
+            mean=self._layout.cells_of("found.mean", "found.covariance"),
+            mean_tangents=self._layout.cells_of(tangent_name("found", "mean")),
+            widest=self._layout.cells_of("middle", "widest"),
         )
-        self._nodes = engine_loop.init_interpolation(float(params.off), self._count, d, self.dtype)
-
-    def _report_cells(self, mean: str, covariance: str) -> NDArray[np.int64]:
-        """Return the cells of a mean, and then of a covariance."""
-        d, cells = self._model.dimension, self._layout.cells
-        names = [f"{mean}.{k}" for k in range(d)] + [f"{covariance}.{k}" for k in range(d * d)]
-        return np.array([cells[name] for name in names], np.int64)
+        self._nodes = engine_loop.init_interpolation(
+            float(params.off), self._count, d, self.dtype, has_tangents=count > 0
+        )
 
     @property
     def n_interpolated(self) -> int:
@@ -438,11 +638,31 @@ class CompiledFilter:
         Returns:
             The state at the end, and the stacked reports.
         """
+        made = self.run(candidates, noise, state, n_cloud)
+        after = made.particles, made.log_weights, *made.cells.values()
+        reports = (getattr(made.out, field.name) for field in dataclasses.fields(BatchInfo))
+        return ParticleState(*map(jnp.asarray, after)), BatchInfo(*map(jnp.asarray, reports))
+
+    def run(
+        self, candidates: Candidates, noise: RandomNumbers, state: ParticleState, n_cloud: int = 0
+    ) -> FilterRun:
+        """Run the filter over stacked batches, without JAX, as a program's callback must.
+
+        Args:
+            candidates: Stacked batches.
+            noise: Random numbers.
+            state: State at the start, which does not depend on the parameters.
+            n_cloud: Number of particles to report for each batch.
+
+        Returns:
+            The state at the end, and the reports.
+        """
         layout, rows, count = self._layout, self._rows, self._count
         cells = np.zeros(len(layout.cells), self.dtype)
         work = np.zeros((1 + max(layout.rows.values()), layout.row_size), self.dtype)
-        work[rows.particles, :count] = np.asarray(state.particles).T
-        work[rows.log_weights, :count] = state.log_weights
+        n, d, real = len(candidates.elapsed), self._model.dimension, self.dtype
+        work[rows.particles[:d], :count] = np.asarray(state.particles).T
+        work[rows.log_weights[0], :count] = state.log_weights
         names = ("searching", "votes", "chance", "mean_contrast", "age")
         for name in names:
             cells[layout.cells[f"state.{name}.0"]] = getattr(state, name)
@@ -451,7 +671,6 @@ class CompiledFilter:
             *(np.asarray(getattr(candidates, name)) for name in BatchArrays._fields[:9]),
             *map(np.asarray, (noise.normal, noise.uniform, noise.cloud)),
         )
-        n, d, real = len(batches.elapsed), self._model.dimension, self.dtype
         out = InfoArrays(
             mean=np.zeros((n, d), real),
             covariance=np.zeros((n, d, d), real),
@@ -460,13 +679,15 @@ class CompiledFilter:
             lag=np.zeros(n, real),
             evidence=np.zeros(n, real),
             cloud=np.zeros((n, n_cloud, d), real),
+            mean_tangents=np.zeros((n, len(rows.mean_tangents)), real),
         )
         memory = Memory(cells, work, self._numbers)
         engine_loop.run(self._functions, memory, rows, batches, out, self._nodes)
-        after = [
-            work[rows.particles, :count].T.copy(),
-            work[rows.log_weights, :count].copy(),
-            cells[layout.cells["state.searching.0"]] != 0,
-            *(cells[layout.cells[f"state.{name}.0"]] for name in names[1:]),
-        ]
-        return ParticleState(*map(jnp.asarray, after)), BatchInfo(*map(jnp.asarray, out))
+        last: dict[str, Any] = {name: cells[layout.cells[f"state.{name}.0"]] for name in names}
+        last["searching"] = last["searching"] != 0
+        return FilterRun(
+            work[rows.particles[:d], :count].T.copy(),
+            work[rows.log_weights[0], :count].copy(),
+            last,
+            out,
+        )

@@ -65,6 +65,9 @@ class ModelFunctions(NamedTuple):
 class RowIndices(NamedTuple):
     """Rows of `work` that the loop reads and writes, and cells of the report.
 
+    With derivatives, those along all directions are behind the values: of n directions there are
+    (1 + n) d rows in place of d, and 1 + n in place of one.
+
     Attributes:
         particles: (d,) rows of the particles.
         normal: (d,) rows of the normal random numbers.
@@ -72,14 +75,15 @@ class RowIndices(NamedTuple):
         motions: (d,) rows of the motions that are scored: particles, or nodes and checks.
         cloud: (d,) rows of the random numbers of a search.
         restarted: (d,) rows of the particles that a search begins with.
-        log_weights: Row of the log weights before the batch.
-        weights: Row of the weights after it.
-        motion_weights: Row of the weights of the motions that are scored.
-        total: Row of the log-likelihoods of motions.
-        log_likelihood: Row of the log-likelihoods of particles.
-        new_log_weights: Row of the log weights after the batch.
+        log_weights: (1,) row of the log weights before the batch.
+        weights: (1,) row of the weights after it.
+        motion_weights: (1,) row of the weights of the motions that are scored.
+        total: (1,) row of the log-likelihoods of motions.
+        log_likelihood: (1,) row of the log-likelihoods of particles.
+        new_log_weights: (1,) row of the log weights after the batch.
         youngest: Row of the ages of the motions of a search; -1: they are all the same.
         mean: Cells of the mean and then of the covariance.
+        mean_tangents: (n d,) cells of the derivatives of the mean.
         widest: Cells of the mean and covariance of a search.
     """
 
@@ -89,14 +93,15 @@ class RowIndices(NamedTuple):
     motions: NDArray[np.int64]
     cloud: NDArray[np.int64]
     restarted: NDArray[np.int64]
-    log_weights: int
-    weights: int
-    motion_weights: int
-    total: int
-    log_likelihood: int
-    new_log_weights: int
+    log_weights: NDArray[np.int64]
+    weights: NDArray[np.int64]
+    motion_weights: NDArray[np.int64]
+    total: NDArray[np.int64]
+    log_likelihood: NDArray[np.int64]
+    new_log_weights: NDArray[np.int64]
     youngest: int
     mean: NDArray[np.int64]
+    mean_tangents: NDArray[np.int64]
     widest: NDArray[np.int64]
 
 
@@ -133,7 +138,7 @@ class BatchArrays(NamedTuple):
 
 
 class InfoArrays(NamedTuple):
-    """Arrays of `filtering.BatchInfo`, to be filled.
+    """Arrays of `filtering.BatchInfo`, to be filled, and derivatives.
 
     Attributes:
         mean: (batches, d) before resampling.
@@ -143,6 +148,7 @@ class InfoArrays(NamedTuple):
         lag: (batches,) time by which the observed motion precedes the last event, s.
         evidence: (batches,) log of the mean likelihood.
         cloud: (batches, n_cloud, d) some particles, drawn by weight.
+        mean_tangents: (batches, n d) derivatives of the mean along n directions.
     """
 
     mean: NDArray
@@ -152,6 +158,7 @@ class InfoArrays(NamedTuple):
     lag: NDArray
     evidence: NDArray
     cloud: NDArray
+    mean_tangents: NDArray
 
 
 class Memory(NamedTuple):
@@ -170,6 +177,7 @@ class Interpolation(NamedTuple):
     counters: NDArray[np.int64]
     # (d, MAX_NODES_PER_COMPONENT, N) polynomial of each node of a component at the particles.
     basis: NDArray
+    slopes: NDArray  # likewise its derivatives by the component; (0, ...) without derivatives
     product: NDArray  # (N,) scratch
     checked: NDArray[np.int64]  # particles
 
@@ -186,7 +194,7 @@ class Context(NamedTuple):
 
 
 def init_interpolation(
-    bound: float, particles: int, dimension: int, dtype: np.dtype
+    bound: float, particles: int, dimension: int, dtype: np.dtype, *, has_tangents: bool = False
 ) -> Interpolation:
     """Start with the fewest nodes.
 
@@ -195,17 +203,17 @@ def init_interpolation(
         particles: Number of particles, N.
         dimension: Number of components, d.
         dtype: Type of real numbers.
+        has_tangents: Whether log-likelihoods have derivatives.
 
     Returns:
         The state.
     """
-    basis, product = (
-        np.zeros((dimension, MAX_NODES_PER_COMPONENT, particles), dtype),
-        np.zeros(particles, dtype),
-    )
+    shape = dimension, MAX_NODES_PER_COMPONENT, particles
+    basis, product = np.zeros(shape, dtype), np.zeros(particles, dtype)
+    slopes = np.zeros(shape if has_tangents else (0, *shape[1:]), dtype)
     checked = np.zeros(MOTIONS_PER_BLOCK + MIN_CHECKED_PARTICLES, np.int64)
     return Interpolation(
-        bound, np.array([MIN_NODES_PER_COMPONENT, 0, 0, 0]), basis, product, checked
+        bound, np.array([MIN_NODES_PER_COMPONENT, 0, 0, 0]), basis, slopes, product, checked
     )
 
 
@@ -263,10 +271,11 @@ def _score(context, b, nodes):
     """
     rows, cells, work = context.rows, context.cells, context.work
     count = context.batches.normal.shape[1]
-    searching, d = cells[SEARCHING] != 0, len(rows.predicted)
+    searching, d = cells[SEARCHING] != 0, len(rows.normal)
     if cells[HAS_EVENTS] == 0:
         cells[BATCH_VOTES] = cells[BATCH_CHANCE] = 0
-        work[rows.log_likelihood, :count] = 0
+        for k in range(len(rows.log_likelihood)):
+            work[rows.log_likelihood[k], :count] = 0
         return cells[BATCH_VOTES]
     if not searching and _can_interpolate(nodes, d, count):
         lanes = _place_nodes(nodes, work, rows, count)
@@ -281,8 +290,9 @@ def _score(context, b, nodes):
         _sort(order[:count], work[rows.youngest])
     _place_particles(rows, work, order, count)
     lag = _score_events(context, b, len(order))
-    for i in range(count):
-        work[rows.log_likelihood, order[i]] = work[rows.total, i]
+    for k in range(len(rows.total)):
+        for i in range(count):
+            work[rows.log_likelihood[k], order[i]] = work[rows.total[k], i]
     return lag
 
 
@@ -300,7 +310,9 @@ def _place_particles(rows, work, order, count):
         particle = order[min(i, count - 1)]
         for k in range(len(rows.motions)):
             work[rows.motions[k], i] = work[rows.predicted[k], particle]
-        work[rows.motion_weights, i] = work[rows.weights, particle] if i < count else 0
+        for k in range(len(rows.weights)):
+            weight = work[rows.weights[k], particle]
+            work[rows.motion_weights[k], i] = weight if i < count else 0
 
 
 @njit_inlined
@@ -335,7 +347,8 @@ def _score_events(context, b, lanes):
         The mean lag, s.
     """
     cells, batches = context.cells, context.batches
-    context.work[context.rows.total, :lanes] = 0
+    for k in range(len(context.rows.total)):
+        context.work[context.rows.total[k], :lanes] = 0
     cells[BATCH_VOTES] = cells[BATCH_CHANCE] = 0
     lag, valid = cells[BATCH_VOTES], 0
     for e in range(batches.age.shape[1]):
@@ -390,12 +403,14 @@ def _report(context, b, out):
         out.mean[b, k] = cells[source[k]]
         for j in range(d):
             out.covariance[b, k, j] = cells[source[d + k * d + j]]
+    for k in range(len(rows.mean_tangents)):
+        out.mean_tangents[b, k] = cells[rows.mean_tangents[k]] if is_finite else 0
     out.searching[b] = cells[REPORTED_SEARCHING] != 0
     out.contrast[b], out.evidence[b] = cells[CONTRAST], cells[EVIDENCE]
     if is_finite and out.cloud.shape[1]:
         count = context.batches.normal.shape[1]
         drawn = np.empty(out.cloud.shape[1], np.int64)
-        _draw(work[rows.new_log_weights], drawn, cells.dtype.type(0.5), count)
+        _draw(work[rows.new_log_weights[0]], drawn, cells.dtype.type(0.5), count)
         for i in range(len(drawn)):
             for k in range(d):
                 out.cloud[b, i, k] = work[rows.predicted[k], drawn[i]]
@@ -416,16 +431,23 @@ def _resample(context, uniform):
         drawn = np.arange(count)
         source = rows.restarted
         if cells[LOST] == 0:
-            _draw(work[rows.new_log_weights], drawn, uniform, count)
+            _draw(work[rows.new_log_weights[0]], drawn, uniform, count)
             source = rows.predicted
-        for k in range(len(source)):
+        for k in range(len(rows.particles)):
+            for i in range(count):  # those of a search have no derivatives
+                kept = k < len(source)
+                work[rows.particles[k], i] = work[source[k], drawn[i]] if kept else 0
+        work[rows.log_weights[0], :count] = equal
+        # Weights keep their derivatives, see `filtering.resample`.
+        for k in range(1, len(rows.log_weights)):
             for i in range(count):
-                work[rows.particles[k], i] = work[source[k], drawn[i]]
-        work[rows.log_weights, :count] = equal
+                score = work[rows.new_log_weights[k], drawn[i]]
+                work[rows.log_weights[k], i] = score if cells[LOST] == 0 else 0
     else:
         for k in range(len(rows.predicted)):
             _copy(work[rows.predicted[k]], work[rows.particles[k]], count)
-        _copy(work[rows.new_log_weights], work[rows.log_weights], count)
+        for k in range(len(rows.log_weights)):
+            _copy(work[rows.new_log_weights[k]], work[rows.log_weights[k]], count)
 
 
 @njit_inlined
@@ -515,7 +537,7 @@ def _place_nodes(nodes, work, rows, count):
         Number of nodes and checks.
     """
     motions, predicted, weights = rows.motions, rows.predicted, rows.motion_weights
-    real, d, k = work.dtype.type, len(predicted), nodes.counters[NODES_COUNTER]
+    real, d, k = work.dtype.type, len(rows.normal), nodes.counters[NODES_COUNTER]
     number, lanes = k**d, _count_lanes(nodes, d)
     for c in range(d):
         row = work[predicted[c]]
@@ -528,18 +550,24 @@ def _place_nodes(nodes, work, rows, count):
         for i in range(number):
             work[motions[c], i] = middle + half * real(_chebyshev(k, i // k ** (d - 1 - c) % k))
         for j in range(k):
-            _fill_basis(nodes.basis[c, j], row, middle, half, k, real(_chebyshev(k, j)))
+            z = real(_chebyshev(k, j))
+            _fill_basis(nodes.basis[c, j], row, middle, half, k, z)
+            if len(nodes.slopes):
+                _fill_slopes(nodes.slopes[c, j], row, middle, half, k, z)
     for i in range(number, lanes):
         particle = (
             (i - number) * count // (lanes - number) + nodes.counters[BATCH_COUNTER]
         ) % count
         nodes.checked[i - number] = particle
-        for c in range(d):
+        for c in range(len(motions)):
             work[motions[c], i] = work[predicted[c], particle]
-    work[weights, :lanes] = 0
+    for c in range(d, len(motions)):  # nodes stay where they are
+        work[motions[c], :number] = 0
+    for c in range(len(weights)):
+        work[weights[c], :lanes] = 0
     for j in range(number):
         _fill_product(nodes, j, d)
-        work[weights, j] = _dot(nodes.product, work[rows.weights], count)
+        work[weights[0], j] = _dot(nodes.product, work[rows.weights[0]], count)
     return lanes
 
 
@@ -557,13 +585,14 @@ def _interpolate_log_likelihoods(nodes, work, rows, lanes, count):
     Returns:
         Whether the checks are within the bound.
     """
-    of_particles, of_motions, d = rows.log_likelihood, rows.total, len(rows.motions)
+    of_particles, of_motions = rows.log_likelihood[0], rows.total[0]
+    d = len(rows.normal)
     number = nodes.counters[NODES_COUNTER] ** d
     work[of_particles, :count] = 0
     for j in range(number):
         _fill_product(nodes, j, d)
         _add_product(work[of_particles], nodes.product, work[of_motions, j], count)
-    top, before = -np.inf, work[rows.log_weights]
+    top, before = -np.inf, work[rows.log_weights[0]]
     for i in range(number, lanes):
         top = max(top, before[nodes.checked[i - number]] + work[of_motions, i])
     error = 0.0
@@ -574,6 +603,7 @@ def _interpolate_log_likelihoods(nodes, work, rows, lanes, count):
         error = max(error, off) if off == off else np.inf
     fits = error <= nodes.bound
     if fits:
+        _interpolate_tangents(nodes, work, rows, number, count)
         nodes.counters[INTERPOLATED_COUNTER] += 1
         if (
             error <= REDUCING_ERROR_RATIO * nodes.bound
@@ -589,6 +619,38 @@ def _interpolate_log_likelihoods(nodes, work, rows, lanes, count):
             nodes.counters[NODES_COUNTER] -= 1
             nodes.counters[WAIT_COUNTER] = N_BATCHES_WITHOUT_NODES
     return fits
+
+
+@njit_inlined
+def _interpolate_tangents(nodes, work, rows, number, count):
+    """Interpolate the derivatives of particles' log-likelihoods, of p(theta(t), t) by t.
+
+    Of the polynomial p = sum_j p_j L_j(theta) with the values p_j of nodes that do not move they
+    are sum_j L_j dp_j / dt + p_j (dL_j / dtheta) dtheta / dt.
+
+    Args:
+        nodes: `Interpolation`.
+        work: (rows, motions) numbers of the motions.
+        rows: `RowIndices`.
+        number: Number of nodes.
+        count: Number of particles.
+    """
+    d = len(rows.normal)
+    for n in range(1, len(rows.total)):
+        work[rows.log_likelihood[n], :count] = 0
+    if len(nodes.slopes) == 0:
+        return
+    for j in range(number):
+        _fill_product(nodes, j, d)
+        for n in range(1, len(rows.total)):
+            value = work[rows.total[n], j]
+            _add_product(work[rows.log_likelihood[n]], nodes.product, value, count)
+        for c in range(d):
+            _fill_slope_product(nodes, j, c, d)
+            value = work[rows.total[0], j]
+            for n in range(1, len(rows.total)):
+                changes = work[rows.predicted[n * d + c]]
+                _add_products(work[rows.log_likelihood[n]], nodes.product, changes, value, count)
 
 
 @njit_inlined
@@ -632,6 +694,33 @@ def _fill_basis(basis, row, middle, half, k, z):
 
 
 @njit_fastmath_inlined
+def _fill_slopes(slopes, row, middle, half, k, z):
+    """Differentiate Lagrange's polynomial of a node, see `_fill_basis`, by the component.
+
+    With U_m(y) = dT_m / dy these are U_m+1 = 2 T_m + 2 y U_m - U_m-1.
+
+    Args:
+        slopes: (N,) output.
+        row: (N,) a component of the particles.
+        middle: Middle of its range.
+        half: Half of its range.
+        k: Number of nodes.
+        z: The node, -1 to 1.
+    """
+    real = row.dtype.type
+    for i in range(len(slopes)):
+        y = (row[i] - middle) / half
+        before, now, of_before, of_now = real(1), y, real(1), z
+        slope_before, slope, total = real(0), real(1), real(0)
+        for _ in range(1, k):
+            total += slope * of_now
+            slope_before, slope = slope, real(2) * (now + y * slope) - slope_before
+            before, now = now, real(2) * y * now - before
+            of_before, of_now = of_now, real(2) * z * of_now - of_before
+        slopes[i] = total * real(2) / (real(k) * half)
+
+
+@njit_fastmath_inlined
 def _fill_product(nodes, j, d):
     """Multiply the polynomials of the components of a node, into `nodes.product`.
 
@@ -648,6 +737,27 @@ def _fill_product(nodes, j, d):
         one = nodes.basis[c, j // k ** (d - 1 - c) % k]
         for i in range(len(product)):
             product[i] *= one[i]
+
+
+@njit_fastmath_inlined
+def _fill_slope_product(nodes, j, moving, d):
+    """Differentiate the product of a node by one component, into `nodes.product`.
+
+    Args:
+        nodes: `Interpolation`.
+        j: Number of the node among those of all components.
+        moving: The component.
+        d: Number of components.
+    """
+    k = nodes.counters[NODES_COUNTER]
+    product, one = nodes.product, nodes.slopes[moving, j // k ** (d - 1 - moving) % k]
+    for i in range(len(product)):
+        product[i] = one[i]
+    for c in range(d):
+        if c != moving:
+            one = nodes.basis[c, j // k ** (d - 1 - c) % k]
+            for i in range(len(product)):
+                product[i] *= one[i]
 
 
 @njit_fastmath_inlined
@@ -680,3 +790,18 @@ def _add_product(out, product, value, count):
     """
     for i in range(count):
         out[i] += product[i] * value
+
+
+@njit_fastmath_inlined
+def _add_products(out, product, factors, value, count):
+    """Add a multiple of the products of two vectors' numbers to another vector.
+
+    Args:
+        out: (count or more,), in place.
+        product: (count or more,).
+        factors: (count or more,).
+        value: The factor.
+        count: How many.
+    """
+    for i in range(count):
+        out[i] += product[i] * factors[i] * value

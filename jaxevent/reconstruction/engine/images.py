@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from jaxevent.codegen import run_over_rows
 from jaxevent.codegen.derivative import (
     DerivativeDirections,
-    is_zero_tangent,
+    moving_numbers,
     refuse_second_derivatives,
     zero_tangents,
 )
@@ -728,14 +728,12 @@ def _images_jvp(about: Any, primals: Any, tangents: Any) -> Any:
         Mean, variance and valid, each (times, pixels), and their tangents.
     """
     number, rows, params = primals
-    changes = jax.tree.leaves(tangents[2], is_leaf=is_zero_tangent)
-    moving = [k for k, change in enumerate(changes) if not is_zero_tangent(change)]
-    numbers = tuple((k, place) for k in moving for place in range(changes[k].size))
+    numbers, changes = moving_numbers(tangents[2])
     if not numbers:
         images = _images(about, number, rows, params)
         return images, zero_tangents(images)
     mean, variance, valid, derivatives = _with_derivatives((*about, numbers), number, rows, params)
-    change = jnp.concatenate([jnp.ravel(changes[k]) for k in moving]).astype(derivatives.dtype)
+    change = jnp.concatenate([jnp.ravel(change) for change in changes]).astype(derivatives.dtype)
     change = jnp.pad(change, (0, derivatives.shape[-1] - change.size))
     moved = jnp.einsum("tpil,l->tpi", derivatives, change)
     d_variance = moved[..., 1] if moved.shape[-1] > 1 else jnp.zeros_like(variance)
