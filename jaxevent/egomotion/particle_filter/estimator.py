@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from jaxevent import threads
 from jaxevent.camera import PinholeCamera
-from jaxevent.codegen.module import make_kernel
+from jaxevent.codegen.module import choose_backend, make_kernel, programs_may_call
 from jaxevent.deprecated import renamed_methods
 from jaxevent.egomotion.candidates import (
     CandidateBatches,
@@ -30,7 +30,6 @@ from jaxevent.egomotion.estimator import (
     TrainingSegment,
 )
 from jaxevent.egomotion.evidence import EvidenceTest, LockDetector, report_before_lock
-from jaxevent.egomotion.geometry import length
 from jaxevent.egomotion.live import LiveMotion
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import CovarianceCalibration, MotionEstimate
@@ -38,6 +37,11 @@ from jaxevent.egomotion.particle_filter import filtering
 from jaxevent.egomotion.particle_filter.engine import CompiledFilter
 from jaxevent.egomotion.particle_filter.filtering import BatchInfo, ParticleState, RandomNumbers
 from jaxevent.egomotion.particle_filter.params import Params
+from jaxevent.egomotion.particle_filter.training import (
+    TrainingKernel,
+    WarmStartedRuns,
+    training_spread,
+)
 from jaxevent.egomotion.patches import ImageSpeed, is_camera_known_to_move
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
@@ -59,7 +63,6 @@ TIME_PENALTY_RATIO = 25.0  # r_t per median image speed
 MIN_SEARCH_SPEED_RATIO = 2.5  # median image speeds, least largest speed of a search
 MIN_GAP_BATCHES = 1.2  # longest batches, time between two from which the sensor was silent
 MIN_KERNEL_EVENTS = 100_000  # scored events from which a kernel is compiled
-RELATIVE_TRAINING_SPREAD = 0.2  # of the first particles of a fit, relative to the true motion
 # The maximum of the votes is up to about half a per cent beside the motion.
 PLANAR_CALIBRATION = CovarianceCalibration(share=0.005, change=0.2)
 GENERAL_CALIBRATION = CovarianceCalibration(0.7, share=0.005, change=0.2)
@@ -366,10 +369,13 @@ class VotingEstimator(MotionEstimator[Params]):
         model: type[Model],
         runs: int,
         settle: float | int,
+        *,
+        compiler: str | None = None,
     ) -> list[TrainingRuns]:
         # Particles start around the true motion, so that no search is fitted. Segments are padded
         # to one shape, so that one program serves all; random numbers stay the same.
         sampled = [self._sample_segment(segment, params, model) for segment in segments]
+        kernel = self._training_kernel(params, sampled[0][0], compiler) if sampled else None
         most = max((len(candidates.elapsed) for _, candidates, _ in sampled), default=0)
         most_candidates = max((candidates.most_used for _, candidates, _ in sampled), default=0)
         real = np.dtype(jnp.result_type(float))
@@ -403,9 +409,19 @@ class VotingEstimator(MotionEstimator[Params]):
                     jax.tree.map(pad, candidates.shorten(most_candidates)),
                     noise,
                     start,
+                    kernel,
                 )
             )
         return jax.device_put(prepared)
+
+    def _training_kernel(
+        self, params: Params, model: Model, compiler: str | None
+    ) -> TrainingKernel | None:
+        """Return the kernel of a fit's runs, or None where XLA compiles them."""
+        serves = jnp.result_type(float) == np.float32
+        if choose_backend(compiler, serves) == "xla" or not programs_may_call(self.name, compiler):
+            return None
+        return make_kernel(self.name, compiler, serves, lambda: TrainingKernel.of(params, model))
 
     def _sample_segment(
         self, segment: TrainingSegment, params: Params, model: type[Model]
@@ -426,7 +442,7 @@ class VotingEstimator(MotionEstimator[Params]):
 
         def find_range(us: int) -> CandidateRange:
             truth = segment.known(np.clip([us], segment.known.t[0], segment.known.t[-1]))[0]
-            near = MotionRange(truth, _training_spread(kind, truth))
+            near = MotionRange(truth, training_spread(kind, truth))
             return candidate_range(params, kind, corners, near)
 
         recording, start, stop = segment.recording, segment.start, segment.stop
@@ -611,48 +627,6 @@ class ChunkRunner:
         self._number += 1
         self.row = int(sample.row.max(initial=self.row - 1)) + 1
         return t, info, reported
-
-
-class WarmStartedRuns(TrainingRuns):
-    """Runs of the filter over a segment, with particles that start around the true motion."""
-
-    candidates: Candidates
-    noise: RandomNumbers  # leaves begin with [runs]
-    start: Float[Array | np.ndarray, "N d"]  # standard normal, of the first particles
-
-    def estimates(self, params: Params) -> tuple[Array, Array]:
-        return jax.vmap(lambda noise: self.estimates_of_run(params, noise))(self.noise)
-
-    def estimates_of_run(self, params: Params, noise: RandomNumbers) -> tuple[Array, Array]:
-        """Return the means (T, d) and lags (T,) of one run.
-
-        Args:
-            params: The parameters.
-            noise: Random numbers of the run.
-
-        Returns:
-            Means and lags (s).
-        """
-        first, normal = jnp.asarray(self.truth)[0], jnp.asarray(self.start)
-        particles = []
-        spread = _training_spread(self.model, first)
-        for part in self.model.parts:
-            near = first[part.rows] + spread[part.rows] * normal[:, part.rows]
-            if part.direction:
-                near = near / length(near)[:, None]
-            particles.append(near)
-        state = filtering.init_near(params, jnp.concatenate(particles, 1))
-        _, info = filtering.run(params, self.model, self.candidates, noise, state)
-        return info.mean, info.lag
-
-
-def _training_spread(model: Model, motion: Any) -> Any:
-    """Return the standard deviations (d,) of the first particles of a fit around a motion (d,)."""
-    out = jnp.zeros_like(motion)
-    for part in model.parts:
-        size = jnp.sqrt((motion[part.rows] ** 2).mean())
-        out = out.at[part.rows].set(RELATIVE_TRAINING_SPREAD * size)
-    return out
 
 
 def calibrate(
