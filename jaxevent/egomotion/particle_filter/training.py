@@ -112,6 +112,7 @@ def _evaluate(
     candidates, noise, particles = given
     model, directions = kind(float(f)), DerivativeDirections(numbers)
     with jax.ensure_compile_time_eval():
+        params = jax.tree.map(jnp.asarray, params)
         state = jax.tree.map(np.asarray, filtering.init_near(params, jnp.asarray(particles)))
 
     def run(k: int) -> Any:
