@@ -38,7 +38,15 @@ RELATIVE_TRAINING_SPREAD = 0.2  # of the first particles of a fit, relative to t
 
 
 def training_spread(model: Model, motion: Any) -> Any:
-    """Return the standard deviations (d,) of the first particles of a fit around a motion (d,)."""
+    """Return how far the first particles of a fit are from the true motion.
+
+    Args:
+        model: Motion model of d components.
+        motion: (d,) the motion, in the units of the model.
+
+    Returns:
+        (d,) standard deviations.
+    """
     sizes = [jnp.sqrt((motion[part.rows] ** 2).mean()) for part in model.parts]
     parts = zip(model.parts, sizes, strict=True)
     spread = [jnp.full_like(motion[part.rows], size) for part, size in parts]
