@@ -26,11 +26,15 @@ from jaxevent.egomotion.bundle.hypotheses import WindowFit, WindowFitter
 from jaxevent.egomotion.bundle.warp import predict_path
 from jaxevent.egomotion.bundle.windows import Params as BatchParams
 from jaxevent.egomotion.candidates import Candidates
-from jaxevent.egomotion.models import Model
+from jaxevent.egomotion.estimator import TrainingSegment
+from jaxevent.egomotion.models import Model, find_model
 from jaxevent.egomotion.particle_filter import filtering
 from jaxevent.egomotion.particle_filter.engine import CompiledFilter
 from jaxevent.egomotion.particle_filter.params import Params
+from jaxevent.egomotion.truth import KnownMotion
+from jaxevent.runs.egomotion import MotionLoss
 from jaxevent.simulate import motion_scene
+from jaxevent.tuning import evaluate_loss, loss_and_grad
 
 PUBLISHED = 0.1  # M events/s, N = 100
 SIZE, RADIUS, BASELINE = (160, 120), 6, 4.5
@@ -141,7 +145,32 @@ def voting_bench() -> tuple[dict[str, float], dict[str, float]]:
         ratio[f"{name} / numba loop"] = slow / seconds
         ratio[f"{name} / compiled by XLA"] = by_xla / seconds
         ratio[f"{name} / thesis' 0.1 M"] = speed[name] / PUBLISHED
+    loss, gradient, by_xla = fit_seconds()
+    ratio["planar voting: loss and 3 gradients / loss"] = gradient / loss
+    ratio["planar voting: loss and 3 gradients by numba / by XLA"] = by_xla / gradient
     return speed, ratio
+
+
+def fit_seconds() -> tuple[float, float, float]:
+    """CPU seconds of a fit's loss, of loss and 3 gradients, and of these by XLA: two runs."""
+    recording, truth = motion_scene("planar", "constant", 200, size=SIZE, duration=0.3)
+    params = Params(radius=RADIUS, baseline=BASELINE)
+    model, t = find_model("planar"), np.arange(0, 300_000, 1000)
+    known = KnownMotion(model, t, model().from_scene(truth, t * 1e-6))
+    segment = TrainingSegment(recording, 150_000, 250_000, known, 0)
+    raw = {name: params.raw[name][None] for name in ("noise", "alpha", "sigma_x")}
+    found, loss = [], MotionLoss()
+    for compiler, names in (("numba", ()), ("numba", tuple(raw)), ("xla", tuple(raw))):
+        (batch,) = voting.training_runs([segment], params, model, 2, 0.0, compiler=compiler)
+        some = {name: raw[name] for name in names}
+
+        def task(batch: Any = batch, some: Any = some) -> Any:
+            if not some:
+                return evaluate_loss(loss, params, batch)
+            return loss_and_grad(loss, True, params, some, batch)[0]
+
+        found.append(cpu_timed(task, 3))
+    return found[0], found[1], found[2]
 
 
 def batch_bench() -> tuple[dict[str, float], dict[str, float]]:
