@@ -23,7 +23,8 @@ standard errors of the rise's mean over parts. An end that is not found is open.
 Neither holds where the loss is rough at the scale of the interval, so that derivatives tell nothing
 of its changes. There the loss of every part is smoothed: a parabola is fitted to it on a line as
 long as the interval or longer. The formula above, with its derivatives, gives an interval around
-its minimum.
+its minimum. Where the parabola does not fit, as to a flat loss between steep walls, the loss itself
+is followed.
 """
 
 import dataclasses
@@ -369,8 +370,10 @@ def _intervals_of_fitted(sample: _Sample, start: Parameters) -> list[ParameterIn
         else:
             ends = [_find_interval_end(sample, objective, sign) for sign in (-1.0, 1.0)]
             rough = _has_no_skill(sample, k, scales[k], ends)
-        if rough:
-            ends = _smoothed_ends(sample, objective) or ends
+        if rough and (smoothed := _smoothed_ends(sample, objective)):
+            ends = smoothed
+        elif rough and trusted:
+            ends = [_find_interval_end(sample, objective, sign) for sign in (-1.0, 1.0)]
         low, high = (None if end is None else sample.at[k] + end * scales[k] for end in ends)
         remark = _remark(sample, k, (sample.at[k] - begun[k]) / scales[k], ends, scales[k])
         if not remark and not settled and np.isfinite(newton[k]):
@@ -434,14 +437,16 @@ def _smoothed_ends(
     """Find the ends of the interval of a smoothed loss.
 
     The loss is smoothed by a parabola over the shortest line that holds the interval and determines
-    the curvature to a quarter.
+    the curvature to a quarter. The interval is extended to where the fit ended, to which such data
+    can lead.
 
     Args:
         sample: The loss of all parts.
         objective: Function of a step that returns the losses (parts,), None outside the bounds.
 
     Returns:
-        The ends, unit steps; None if the loss has no minimum near.
+        The ends, unit steps; None if the loss has no minimum near, or is no parabola, as a flat one
+            between steep walls.
     """
     if sample.count < 3:
         return None
@@ -456,7 +461,8 @@ def _smoothed_ends(
         table = np.array([value for value in found if value is not None])
         if len(table) < N_SMOOTHED or not np.isfinite(table).all():
             return None
-        half_curvature, slope, _ = np.polyfit(steps, table, 2)
+        coefficients = np.polyfit(steps, table, 2)
+        half_curvature, slope, _ = coefficients
         H = 2 * sample.shares @ half_curvature
         if not H > MIN_CURVATURE_ERRORS * standard_error(2 * half_curvature):
             continue
@@ -464,7 +470,12 @@ def _smoothed_ends(
         each = slope + 2 * half_curvature * lowest
         width = sample.quantile * standard_error(each) / H
         if abs(lowest) + width <= reach:
-            return [lowest - width, lowest + width]
+            residuals = table - np.vander(steps, 3) @ coefficients
+            errors = [standard_error(each) for each in residuals]
+            off = (residuals @ sample.shares) / np.maximum(errors, 1e-300)
+            if np.sqrt(np.mean(off**2)) > sample.quantile:
+                return None
+            return [min(lowest - width, 0.0), max(lowest + width, 0.0)]
     return None
 
 

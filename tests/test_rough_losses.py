@@ -121,6 +121,23 @@ def test_the_interval_of_a_rough_loss_is_that_of_the_smooth_one():
     np.testing.assert_allclose(np.log([one.low, one.high]), np.log(expected), atol=0.04)
 
 
+@pytest.mark.parametrize("ended", [0.15, 0.28])
+def test_the_interval_of_a_flat_loss_reaches_from_wall_to_wall(ended):
+    """To which no parabola fits: the one nearest to it has a minimum as sharp as its walls."""
+    shifts = np.random.default_rng(4).normal(0.0, 0.02, 30)
+    phase = np.random.default_rng(5).uniform(0, 6, 30)
+
+    def loss(params: Toy, batch: Any) -> jax.Array:
+        u = jnp.log(params.a / TRUE) - batch[0]
+        return 4 * jnp.maximum(jnp.abs(u) - 0.3, 0) ** 2 + 0.02 * jnp.cos(300 * u + batch[1])
+
+    batches = [jnp.asarray(pair) for pair in zip(shifts, phase, strict=True)]
+    found = Toy(a=TRUE * float(np.exp(ended)))
+    one = confidence_intervals(loss, Toy(), found, ["a"], batches)["a"]
+    assert one.remark == ROUGH
+    np.testing.assert_allclose(np.log(np.array([one.low, one.high]) / TRUE), [-0.3, 0.3], atol=0.08)
+
+
 def test_the_results_say_it():
     row: dict[str, Any] = {
         "method": "voting", "parameter": "r_t", "unit": "px/s", "start": 1e4, "found": 50.0,
