@@ -46,6 +46,8 @@ GATED = {
     "tracker, M = 32, `estimate` by numba / numba loop": ("higher", 0.4),
     "tracker, M = 1: loss and 3 gradients / loss": ("lower", 0.4),
     "tracker, M = 1: loss and 3 gradients by numba / by XLA": ("higher", 0.5),
+    "planar voting: loss and 3 gradients / loss": ("lower", 0.4),
+    "planar voting: loss and 3 gradients by numba / by XLA": ("higher", 0.5),
     "planar voting, N = 200 / numba loop": ("higher", 0.4),
     "rotation voting, N = 200 / numba loop": ("higher", 0.4),
     "general voting, N = 500 / numba loop": ("higher", 0.4),

@@ -150,6 +150,20 @@ MUTATIONS = (
         "tests/blob/test_blob_fused.py -k slopes -k moment",
     ),
     Mutation(
+        "voting: resampled particles lose the scores of their weights",
+        "jaxevent/egomotion/particle_filter/engine_loop.py",
+        "score if cells[LOST] == 0 else 0",
+        "0 * score",
+        "tests/egomotion/test_voting_engine.py -k slopes_of_the_kernel -k planar",
+    ),
+    Mutation(
+        "intervals of rough losses are a parabola's, whether it fits or not",
+        "jaxevent/confidence.py",
+        "np.sqrt(np.mean(off**2)) > sample.quantile",
+        "False",
+        "tests/test_rough_losses.py -k wall_to",
+    ),
+    Mutation(
         "dead pixels are looked for among those that fire",
         "jaxevent/calibration/hot.py",
         "between |= pair",

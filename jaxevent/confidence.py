@@ -362,7 +362,8 @@ def _intervals_of_fitted(sample: _Sample, start: Parameters) -> list[ParameterIn
     findings = []
     for k, ((name, index), number) in enumerate(zip(sample.places, numbers, strict=True)):
         settled = abs(newton[k]) <= max(widths[k], DIFFERENCE_LOG_STEP)
-        objective = functools.partial(_losses_at_step, sample, k, scales[k])
+        # Longer lines have every other point of shorter ones.
+        objective = functools.cache(functools.partial(_losses_at_step, sample, k, scales[k]))
         trusted = widths[k] < MAX_TRUSTED_LOG_WIDTH and settled
         if trusted:
             ends = [-widths[k], widths[k]]
@@ -456,7 +457,7 @@ def _smoothed_ends(
         return math.sqrt(apart @ apart * sample.count / (sample.count - 1))
 
     for reach in SMOOTHED_REACHES:
-        steps = np.linspace(-reach, reach, N_SMOOTHED)
+        steps = np.arange(-(N_SMOOTHED // 2), N_SMOOTHED // 2 + 1) * (2 * reach / (N_SMOOTHED - 1))
         found = [objective(float(step)) for step in steps]
         table = np.array([value for value in found if value is not None])
         if len(table) < N_SMOOTHED or not np.isfinite(table).all():
