@@ -107,6 +107,6 @@ def test_what_kernels_have_no_derivatives_of_is_refused():
 
 def test_the_literal_likelihood_is_left_to_xla():
     _, batch = prepared(likelihood="literal")
-    assert batch.kernel is None
+    assert not batch.by_kernel
     with pytest.raises(InputError, match="no kernel"):
         prepared(likelihood="literal", compiler="numba")

@@ -38,7 +38,6 @@ from jaxevent.egomotion.particle_filter.engine import CompiledFilter
 from jaxevent.egomotion.particle_filter.filtering import BatchInfo, ParticleState, RandomNumbers
 from jaxevent.egomotion.particle_filter.params import Params
 from jaxevent.egomotion.particle_filter.training import (
-    TrainingKernel,
     WarmStartedRuns,
     training_spread,
 )
@@ -375,9 +374,9 @@ class VotingEstimator(MotionEstimator[Params]):
         # Particles start around the true motion, so that no search is fitted. Segments are padded
         # to one shape, so that one program serves all; random numbers stay the same.
         sampled = [self._sample_segment(segment, params, model) for segment in segments]
-        kernel = self._training_kernel(params, sampled[0][0], compiler) if sampled else None
+        by_kernel = bool(sampled) and self._trains_by_kernel(params, sampled[0][0], compiler)
         most = max((len(candidates.elapsed) for _, candidates, _ in sampled), default=0)
-        most_candidates = max((candidates.most_used for _, candidates, _ in sampled), default=0)
+        most_candidates = max((1, *(candidates.most_used for _, candidates, _ in sampled)))
         real = np.dtype(jnp.result_type(float))
         prepared: list[TrainingRuns] = []
         for number, (segment, (kind, candidates, t)) in enumerate(
@@ -409,19 +408,18 @@ class VotingEstimator(MotionEstimator[Params]):
                     jax.tree.map(pad, candidates.shorten(most_candidates)),
                     noise,
                     start,
-                    kernel,
+                    by_kernel,
                 )
             )
         return jax.device_put(prepared)
 
-    def _training_kernel(
-        self, params: Params, model: Model, compiler: str | None
-    ) -> TrainingKernel | None:
-        """Return the kernel of a fit's runs, or None where XLA compiles them."""
+    def _trains_by_kernel(self, params: Params, model: Model, compiler: str | None) -> bool:
+        """Return whether the runs of a fit are a kernel's, not XLA's."""
         serves = jnp.result_type(float) == np.float32
         if choose_backend(compiler, serves) == "xla" or not programs_may_call(self.name, compiler):
-            return None
-        return make_kernel(self.name, compiler, serves, lambda: TrainingKernel.of(params, model))
+            return False
+        make = functools.partial(CompiledFilter, params, model)
+        return make_kernel(self.name, compiler, serves, make) is not None
 
     def _sample_segment(
         self, segment: TrainingSegment, params: Params, model: type[Model]
@@ -429,7 +427,8 @@ class VotingEstimator(MotionEstimator[Params]):
         """Sample the candidates that motions near the true one need, chunk by chunk as `estimate`.
 
         Batches begin when events have come for the largest age of candidates, be they earlier than
-        the segment. Where that is too late, and for the literal likelihood, they begin at once.
+        the segment. Where that is too late they begin at once. The literal likelihood has all
+        candidates of the segment.
 
         Args:
             segment: The segment.
@@ -447,12 +446,13 @@ class VotingEstimator(MotionEstimator[Params]):
 
         recording, start, stop = segment.recording, segment.start, segment.stop
         kind, sampler = self.sampler(recording[start:stop], params, model)
+        if params.likelihood == "literal":
+            whole = sampler.sample_all(0.0, float(params.tau_max))
+            return kind, whole.candidates, whole.t
         corners = _basis_at_corners(kind, sampler)
-        first, lead = recording.event_span()[0], 0
-        if params.likelihood != "literal":
-            lead = round(1e6 * float(np.max(find_range(start).oldest)))
-        begin = max(start, first + lead)
-        if begin < stop and lead:
+        lead = round(1e6 * float(np.max(find_range(start).oldest)))
+        begin = max(start, recording.event_span()[0] + lead)
+        if begin < stop:
             kind, sampler = self.sampler(recording[begin - lead : stop], params, model)
             sampler.skip(begin)
         batches, span = _chunk_size(params)

@@ -6,7 +6,7 @@ parameters, so that gradients in reverse cost the same.
 """
 
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -53,34 +53,18 @@ def training_spread(model: Model, motion: Any) -> Any:
     return RELATIVE_TRAINING_SPREAD * jnp.concatenate(spread)
 
 
-class TrainingKernel(NamedTuple):
-    """The kernel of runs, by the model alone: its focal length is an input.
-
-    Attributes:
-        kind: The model's class.
-    """
-
-    kind: type[Model]
-
-    @classmethod
-    def of(cls, params: Params, model: Model) -> "TrainingKernel":
-        """Make the kernel; raise `TranslationError` where there is none."""
-        CompiledFilter(params, model)
-        return cls(type(model))
-
-
 class WarmStartedRuns(TrainingRuns):
     """Runs of the filter over a segment, with particles that start around the true motion."""
 
     candidates: Candidates
     noise: RandomNumbers  # leaves begin with [runs]
     start: Float[Array | np.ndarray, "N d"]  # standard normal, of the first particles
-    kernel: TrainingKernel | None = eqx.field(static=True)  # None: XLA compiles the runs
+    by_kernel: bool = eqx.field(static=True)  # or else by XLA
 
     def estimates(self, params: Params) -> tuple[Array, Array]:
         near = self._first_particles()
-        if self.kernel is not None:
-            return _estimate(self.kernel, params, self.model, self.candidates, self.noise, near)
+        if self.by_kernel:
+            return _estimate(params, self.model, self.candidates, self.noise, near)
 
         def run(noise: RandomNumbers) -> tuple[Array, Array]:
             state = filtering.init_near(params, near)
@@ -102,29 +86,28 @@ class WarmStartedRuns(TrainingRuns):
 
 
 def _evaluate(
-    kind: type[Model], numbers: tuple[tuple[int, int], ...], tree: Any, leaves: list[Any]
+    model: Model, numbers: tuple[tuple[int, int], ...], tree: Any, leaves: list[Any]
 ) -> tuple[NDArray, ...]:
     """Run the filter, on the host.
 
     Args:
-        kind: Model of the motion.
+        model: Motion model of d components.
         numbers: Numbers of the parameters by which the means are differentiated.
-        tree: Structure of parameters, focal length, candidates, random numbers and particles.
+        tree: Structure of parameters, candidates, random numbers and particles.
         leaves: Their leaves.
 
     Returns:
         Means (runs, T, d) and lags (runs, T), and with numbers the derivatives of the means
         (runs, T, numbers, d).
     """
-    params, f, *given = jax.tree.unflatten(tree, [np.asarray(leaf) for leaf in leaves])
-    candidates, noise, particles = given
-    model, directions = kind(float(f)), DerivativeDirections(numbers)
+    given = jax.tree.unflatten(tree, [np.asarray(leaf) for leaf in leaves])
+    params, candidates, noise, particles = given
     with jax.ensure_compile_time_eval():
         params = jax.tree.map(jnp.asarray, params)
         state = jax.tree.map(np.asarray, filtering.init_near(params, jnp.asarray(particles)))
 
     def run(k: int) -> Any:
-        kernel = CompiledFilter(params, model, directions)
+        kernel = CompiledFilter(params, model, DerivativeDirections(numbers))
         return kernel.run(candidates, jax.tree.map(lambda leaf: leaf[k], noise), state).out
 
     found = list(map_ahead(run, range(len(noise.uniform))))
@@ -136,33 +119,36 @@ def _evaluate(
 
 
 def _call(
-    kernel: TrainingKernel, numbers: tuple[tuple[int, int], ...], *given: Any
+    numbers: tuple[tuple[int, int], ...],
+    params: Params,
+    model: Model,
+    candidates: Candidates,
+    noise: RandomNumbers,
+    particles: Array,
 ) -> tuple[Array, ...]:
     """Call `_evaluate` from a compiled program.
 
     Args:
-        kernel: The kernel.
-        numbers: Numbers by which the means are differentiated.
-        given: Parameters, model, candidates, random numbers and particles.
+        numbers: Numbers of the parameters by which the means are differentiated.
+        params: The parameters.
+        model: Motion model of d components.
+        candidates: The candidates.
+        noise: Random numbers of the runs.
+        particles: (N, d) motions at the start.
 
     Returns:
         What `_evaluate` does.
     """
-    params, model, candidates, noise, particles = given
-    inputs = params, jnp.asarray(model.f), candidates, noise, particles
-    leaves, tree = jax.tree.flatten(inputs)
+    leaves, tree = jax.tree.flatten((params, candidates, noise, particles))
     runs, T, d = len(noise.uniform), len(candidates.elapsed), model.dimension
-    shapes = [(runs, T, d), (runs, T)]
-    if numbers:
-        shapes.append((runs, T, len(numbers), d))
+    shapes = [(runs, T, d), (runs, T)] + [(runs, T, len(numbers), d)] * bool(numbers)
     out = tuple(jax.ShapeDtypeStruct(shape, particles.dtype) for shape in shapes)
-    evaluate = functools.partial(_evaluate, kernel.kind, numbers, tree)
+    evaluate = functools.partial(_evaluate, model, numbers, tree)
     return jax.pure_callback(evaluate, out, leaves, vmap_method="sequential")
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+@jax.custom_jvp
 def _estimate(
-    kernel: TrainingKernel,
     params: Params,
     model: Model,
     candidates: Candidates,
@@ -172,23 +158,21 @@ def _estimate(
     """Return the means (runs, T, d) and lags (runs, T) of all runs.
 
     Args:
-        kernel: The kernel.
         params: The parameters.
-        model: Motion model.
+        model: Motion model of d components.
         candidates: The candidates.
         noise: Random numbers of the runs.
         particles: (N, d) motions at the start.
     """
-    made = _call(kernel, (), params, model, candidates, noise, particles)
-    return made[0], made[1]
+    mean, lag = _call((), params, model, candidates, noise, particles)
+    return mean, lag
 
 
 @full_precision
-def _estimate_jvp(kernel: TrainingKernel, primals: Any, tangents: Any) -> Any:
+def _estimate_jvp(primals: Any, tangents: Any) -> Any:
     """Compute means and lags and their tangents: derivatives times those of parameters, summed.
 
     Args:
-        kernel: The kernel.
         primals: Parameters, model, candidates, random numbers and particles.
         tangents: Tangents of these.
 
@@ -205,21 +189,21 @@ def _estimate_jvp(kernel: TrainingKernel, primals: Any, tangents: Any) -> Any:
         )
     numbers, changes = moving_numbers(tangents[0])
     if not numbers:
-        made = _estimate(kernel, *primals)
+        made = _estimate(*primals)
         return made, zero_tangents(made)
-    mean, lag, slopes = _with_slopes((kernel, numbers), *primals)
+    mean, lag, slopes = _with_slopes(numbers, *primals)
     change = jnp.concatenate([jnp.ravel(change) for change in changes])
     return (mean, lag), (jnp.einsum("rtnd,n->rtd", slopes, change), jnp.zeros_like(lag))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _with_slopes(about: Any, *given: Any) -> tuple[Array, ...]:
-    return _call(*about, *given)
+def _with_slopes(numbers: tuple[tuple[int, int], ...], *given: Any) -> tuple[Array, ...]:
+    return _call(numbers, *given)
 
 
-def _with_slopes_jvp(about: Any, primals: Any, tangents: Any) -> Any:
+def _with_slopes_jvp(numbers: Any, primals: Any, tangents: Any) -> Any:
     refuse_second_derivatives("voting", tangents, 'compiler="xla"')
-    made = _with_slopes(about, *primals)
+    made = _with_slopes(numbers, *primals)
     return made, zero_tangents(made)
 
 
