@@ -544,6 +544,44 @@ _kernels = KernelCache(ModelFunctions, write, max_nodes=MAX_OPERATIONS)
 _tangent_kernels = KernelCache(ModelFunctions, write, max_nodes=4 * MAX_OPERATIONS)
 
 
+def _request_of(
+    params: Params, model: Model, directions: DerivativeDirections
+) -> tuple[KernelCache, Any, Any, Callable[[], TracedProgram]]:
+    """Return the cache of a filter's kernels, and the arguments of its `get`.
+
+    Args:
+        params: The parameters.
+        model: Motion model.
+        directions: Numbers of the parameters by which the mean motion is differentiated.
+
+    Raises:
+        TranslationError: There is no kernel.
+    """
+    dtype, count = np.dtype(jnp.result_type(float)), len(directions.numbers)
+    fields, kind = jax.tree.flatten(_with_focal_length(model, 1.0))
+    if fields:
+        raise TranslationError("numbers that the model holds")
+    return (
+        _tangent_kernels if count else _kernels,
+        (kind, jax.tree.structure(params), dtype, count),
+        directions.inputs(params, ()),
+        lambda: program_of(params, model, dtype, directions),
+    )
+
+
+def check_filter(params: Params, model: Model) -> bool:
+    """Return true, or raise `TranslationError` unless the filter has kernels, with derivatives too.
+
+    Args:
+        params: The parameters.
+        model: Motion model.
+    """
+    for numbers in ((), ((0, 0),)):
+        kernels, *about = _request_of(params, model, DerivativeDirections(numbers))
+        kernels.check(*about)
+    return True
+
+
 class FilterRun(NamedTuple):
     """Results of a filter's kernel, on the host.
 
@@ -578,18 +616,9 @@ class CompiledFilter:
         model: Model,
         directions: DerivativeDirections = DerivativeDirections(),  # noqa: B008
     ):
-        self.dtype = np.dtype(jnp.result_type(float))
-        fields, kind = jax.tree.flatten(_with_focal_length(model, 1.0))
-        if fields:
-            raise TranslationError("numbers that the model holds")
-        count = len(directions.numbers)
-        key = kind, jax.tree.structure(params), self.dtype, count
-        kernels = _tangent_kernels if count else _kernels
-        kernel = kernels.get(
-            key,
-            directions.inputs(params, ()),
-            lambda: program_of(params, model, self.dtype, directions),
-        )
+        self.dtype, count = np.dtype(jnp.result_type(float)), len(directions.numbers)
+        kernels, *about = _request_of(params, model, directions)
+        kernel = kernels.get(*about)
         self._functions, self._numbers = kernel.functions, kernel.numbers
         self._layout, self._count, self._model = kernel.places, params.particles, model
         of, rows, d = self._layout.rows_of, self._layout.rows, model.dimension

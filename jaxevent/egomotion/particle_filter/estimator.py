@@ -34,7 +34,7 @@ from jaxevent.egomotion.live import LiveMotion
 from jaxevent.egomotion.models import Model
 from jaxevent.egomotion.motion import CovarianceCalibration, MotionEstimate
 from jaxevent.egomotion.particle_filter import filtering
-from jaxevent.egomotion.particle_filter.engine import CompiledFilter
+from jaxevent.egomotion.particle_filter.engine import CompiledFilter, check_filter
 from jaxevent.egomotion.particle_filter.filtering import BatchInfo, ParticleState, RandomNumbers
 from jaxevent.egomotion.particle_filter.params import Params
 from jaxevent.egomotion.particle_filter.training import (
@@ -418,8 +418,8 @@ class VotingEstimator(MotionEstimator[Params]):
         serves = jnp.result_type(float) == np.float32
         if choose_backend(compiler, serves) == "xla" or not programs_may_call(self.name, compiler):
             return False
-        make = functools.partial(CompiledFilter, params, model)
-        return make_kernel(self.name, compiler, serves, make) is not None
+        check = functools.partial(check_filter, params, model)
+        return make_kernel(self.name, compiler, serves, check) is not None
 
     def _sample_segment(
         self, segment: TrainingSegment, params: Params, model: type[Model]
