@@ -1100,7 +1100,8 @@ class Recording(HtmlRepr):
                 f"{self.name}: has no calibration, which {what} needs"
                 f"{self.describe_left_out('camera')}; give "
                 "camera=jaxevent.camera.PinholeCamera(fx, fy, cx, cy) in px, here or to "
-                "jaxevent.load, which reads calibrations from YAML, too"
+                "jaxevent.load, which reads calibrations from YAML, too; a recording that a "
+                "configuration names has its own from jaxevent convert --camera"
             )
         return camera
 

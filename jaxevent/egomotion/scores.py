@@ -253,7 +253,7 @@ def warn_of_gyro_axes(motion: MotionEstimate, truth: KnownMotion) -> None:
     if (axes := find_gyro_axes(motion, truth)) is not None:
         warnings.warn(
             f"{motion.recording}: the gyro is like the estimate in other axes; give known_motion "
-            f"rotation={axes!r} if they are its own",
+            f'rotation={axes!r}, or a configuration imu_rotation = "{axes}", if they are its own',
             InputWarning,
             stacklevel=3,
         )

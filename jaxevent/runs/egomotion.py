@@ -66,7 +66,7 @@ from jaxevent.egomotion.estimator import (
 )
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.egomotion.motion import MotionEstimate
-from jaxevent.egomotion.scores import errors_by_part, score_motion
+from jaxevent.egomotion.scores import errors_by_part, score_motion, warn_of_gyro_axes
 from jaxevent.egomotion.truth import KnownMotion, from_gyro, imu_rotation, known_motion
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
@@ -433,6 +433,7 @@ class MotionGoal(Goal):
                 continue
             known = mine[0].known
             motion = self.method.estimate(recording, params, model=self.kind, progress=progress)
+            warn_of_gyro_axes(motion, known)
             t = np.arange(mine[0].start, mine[-1].stop, round(1e6 / SCORE_RATE_HZ))
             t = t[known.covers(t)]
             estimate = motion(t, centred=self.loss.centred)

@@ -132,7 +132,7 @@ def test_what_is_predicted_is_the_sum_over_blobs_and_kernels(stream, background)
     before = measure_blobs(first, *detect_at(first, background, SCALE, t))
     labels, number = detect_at(second, background, SCALE, t)
     last = measure_blobs(second, labels, number)
-    assert number > 2 and told.sums[0] == last.n.sum()
+    assert number > 2 and told.blob_events[0] == last.n.sum()
     ellipses, kernels, moved = np.zeros(len(part)), np.zeros((len(part), 3)), []
     for n, p, C in zip(*last, strict=True):
         k = np.argmin(np.hypot(*(before.p - p).T))
@@ -157,17 +157,17 @@ def test_what_is_predicted_is_the_sum_over_blobs_and_kernels(stream, background)
 def test_scores_are_the_likelihood_of_the_best_shares(stream, background):
     told = [predict_at(stream, background, t)[2] for t in (0.2, 0.3)]
     n = np.concatenate([one.scored.pixels.n for one in told])
-    assert n.sum() == sum(one.scored.number for one in told) > len(n)
+    assert n.sum() == sum(one.scored.n_window_events for one in told) > len(n)
     density = np.concatenate([one.density for one in told]).repeat(n, 0)
     b = np.concatenate([one.scored.background for one in told]).repeat(n)
     share = np.full(4, 0.25)
     for _ in range(15):
         share = share * ((1 / (density @ share + b)) @ density)
         share /= share.sum()
-    nats = np.log(density @ share / b + 1).sum() - sum(one.sums[0] for one in told)
+    nats = np.log(density @ share / b + 1).sum() - sum(one.blob_events[0] for one in told)
     result = score(told)
     assert result.raw == pytest.approx(nats / len(b)) and result.penalised <= result.raw
-    assert result.parts.sum() == pytest.approx(result.raw) and len(result.parts) == 2
+    assert result.by_window.sum() == pytest.approx(result.raw) and len(result.by_window) == 2
 
 
 @pytest.mark.slow

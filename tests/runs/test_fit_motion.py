@@ -17,11 +17,14 @@ import jaxevent.runs.fit
 from jaxevent import cli
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import voting
+from jaxevent.egomotion.models import find_model
+from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.particle_filter import filtering
-from jaxevent.errors import InputError
+from jaxevent.errors import InputError, InputWarning
 from jaxevent.recording import Events, Imu, Poses, Recording
 from jaxevent.runs import egomotion
 from jaxevent.runs.egomotion import FAMILY, MotionLoss
+from jaxevent.runs.family import FitData
 
 VELOCITIES = ((150.0, 80.0), (-90.0, 60.0), (40.0, -170.0))
 START = {"particles": 32, "batch": 16, "every": 4, "noise": 3.0, "tau_max": 0.06}
@@ -167,3 +170,28 @@ def test_settings_say_what_is_true():
         egomotion.check_settings({**turned, "imu_rotation": "up"})
     with pytest.raises(InputError, match="or the depth"):
         egomotion.true_motion(recording, {"model": "planar", "truth": "poses"})
+
+
+def test_a_fit_tells_of_a_gyro_in_other_axes():
+    """Where its scores of the start would only be large."""
+    t = np.linspace(0, 400_000, 41).astype(np.int64)
+    turn = np.stack([np.sin(7e-6 * t), np.cos(5e-6 * t), 0.5 + np.sin(9e-6 * t)], 1)
+    imu = Imu(t, turn * [1.0, -1.0, -1.0], np.zeros_like(turn))
+    camera = PinholeCamera(100.0, 100.0, 3.5, 2.5)
+    events = Events(t, *np.zeros((2, len(t)), np.uint16), np.zeros(len(t), bool))
+    recording = Recording("r", 8, 6, events, camera=camera, imu=imu)
+    kind = find_model("rotation")
+
+    class Known(type(voting)):
+        def estimate(self, *_, **__):
+            covariance = np.tile(np.eye(3), (len(t), 1, 1))
+            return MotionEstimate.from_arrays(kind, t, turn, covariance, np.ones(len(t), bool))
+
+    method = Known("voting", voting.Params)
+    goal = dataclasses.replace(
+        FAMILY.goal(voting, voting.Params(), {"model": "rotation", "truth": "gyro"}), method=method
+    )
+    data = FitData({"fit": [("r", recording)], "validation": [], "test": []}, None, 0.1)
+    with pytest.warns(InputWarning, match="gyro is like the estimate in other axes.*imu_rotation"):
+        rows = list(goal.score(data, voting.Params(), False))
+    assert rows and rows[0]["error"] > 50
