@@ -194,6 +194,7 @@ def open_results(folder: Path) -> Iterator[Write]:
 
 
 INTERVAL_COLUMNS = ("method", "parameter", "start", "found", "95 % interval", "unit", "")
+MIN_TOLD_LOSS = 0.01  # share of the time that a fit loses beside what was lost before
 INDEPENDENT_MEASUREMENTS = "measurements, taken as independent"
 
 
@@ -252,20 +253,20 @@ def compute_gains(tasks: Sequence[Task], rows: Sequence[Row]) -> list[dict[str, 
 
     Returns:
         For each method `method`, `measure`, `split`, and the error `before` and `after`; None if
-        unknown.
+        unknown. Of motions also `lost`, the shares of the time without estimates before and after.
     """
     found = []
     for task in tasks:
-        name = task.goal.measure
-        before, after = (
-            _mean([row.get(name) for row in rows if row["method"] == label])
-            for label in (f"{task.label}, before", task.label)
-        )
+        name, labels = task.goal.measure, (f"{task.label}, before", task.label)
+
+        def mean(of: str, label: str) -> float | None:
+            return _mean([row.get(of) for row in rows if row["method"] == label])
+
+        (before, after), lost = ([mean(of, label) for label in labels] for of in (name, "lost"))
         split = next((row["split"] for row in rows if row["method"] == task.label), None)
-        found.append(
-            {"method": task.label, "measure": name, "split": split, "before": before,
-             "after": after}
-        )  # fmt: skip
+        gain = {"method": task.label, "measure": name, "split": split}
+        gain |= {"before": before, "after": after}
+        found.append(gain if None in lost else {**gain, "lost": lost})
     return found
 
 
@@ -310,6 +311,10 @@ def format_findings(found: Sequence[Mapping[str, Any]], gained: Sequence[Mapping
         if one["measure"] != "nll" and one["before"] > 0:
             change = f" ({100 * (one['after'] / one['before'] - 1):+.0f} %)"
         pair = f"{one['before']:.4g} before, {one['after']:.4g} after"
+        # An error is that of what is estimated: a fit may lower it by estimating less.
+        before, after = one.get("lost") or (0.0, 0.0)
+        if after >= before + MIN_TOLD_LOSS:
+            change += f", but {100 * after:.0f} % of the time is lost, {100 * before:.0f} % before"
         lines.append(f"\nGain of {one['method']}: {one['measure']} of {seen} {pair}{change}.\n")
     return "".join(lines)
 

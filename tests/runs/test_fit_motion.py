@@ -3,7 +3,9 @@
 import dataclasses
 import functools
 import json
+import types
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,11 +22,13 @@ from jaxevent.egomotion import voting
 from jaxevent.egomotion.models import find_model
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.particle_filter import filtering
+from jaxevent.egomotion.particle_filter.estimator import VotingEstimator
 from jaxevent.errors import InputError, InputWarning
 from jaxevent.recording import Events, Imu, Poses, Recording
 from jaxevent.runs import egomotion
 from jaxevent.runs.egomotion import FAMILY, MotionLoss
 from jaxevent.runs.family import FitData
+from jaxevent.runs.results import compute_gains, format_findings
 
 VELOCITIES = ((150.0, 80.0), (-90.0, 60.0), (40.0, -170.0))
 START = {"particles": 32, "batch": 16, "every": 4, "noise": 3.0, "tau_max": 0.06}
@@ -182,7 +186,7 @@ def test_a_fit_tells_of_a_gyro_in_other_axes():
     recording = Recording("r", 8, 6, events, camera=camera, imu=imu)
     kind = find_model("rotation")
 
-    class Known(type(voting)):
+    class Known(VotingEstimator):
         def estimate(self, *_, **__):
             covariance = np.tile(np.eye(3), (len(t), 1, 1))
             return MotionEstimate.from_arrays(kind, t, turn, covariance, np.ones(len(t), bool))
@@ -195,3 +199,18 @@ def test_a_fit_tells_of_a_gyro_in_other_axes():
     with pytest.warns(InputWarning, match="gyro is like the estimate in other axes.*imu_rotation"):
         rows = list(goal.score(data, voting.Params(), False))
     assert rows and rows[0]["error"] > 50
+
+
+@pytest.mark.parametrize("lost", [0.34, 0.1])
+def test_a_gain_by_estimates_that_are_lost_is_told(lost):
+    task: Any = types.SimpleNamespace(label="voting", goal=types.SimpleNamespace(measure="error"))
+    rows = [
+        {"method": name, "error": error, "lost": share, "split": "test"}
+        for name, error, share in (("voting, before", 8.0, 0.1), ("voting", 6.0, lost))
+    ]
+    said = format_findings([], compute_gains([task], rows))
+    assert "8 before, 6 after (-25 %)" in said
+    assert ("but 34 % of the time is lost, 10 % before" in said) == (lost > 0.1)
+    for row in rows:
+        del row["lost"]
+    assert "lost" not in format_findings([], compute_gains([task], rows))
