@@ -364,17 +364,16 @@ def _intervals_of_fitted(sample: _Sample, start: Parameters) -> list[ParameterIn
         settled = abs(newton[k]) <= max(widths[k], DIFFERENCE_LOG_STEP)
         # Longer lines have every other point of shorter ones.
         objective = functools.cache(functools.partial(_losses_at_step, sample, k, scales[k]))
+        follow = functools.partial(_follow_loss, sample, objective)
         trusted = widths[k] < MAX_TRUSTED_LOG_WIDTH and settled
         if trusted:
             ends = [-widths[k], widths[k]]
             rough = _rises_otherwise(sample, objective, widths[k], curvatures[k])
         else:
-            ends = [_find_interval_end(sample, objective, sign) for sign in (-1.0, 1.0)]
+            ends = follow()
             rough = _has_no_skill(sample, k, scales[k], ends)
-        if rough and (smoothed := _smoothed_ends(sample, objective)):
-            ends = smoothed
-        elif rough and trusted:
-            ends = [_find_interval_end(sample, objective, sign) for sign in (-1.0, 1.0)]
+        if rough:
+            ends = _smoothed_ends(sample, objective) or follow()
         low, high = (None if end is None else sample.at[k] + end * scales[k] for end in ends)
         remark = _remark(sample, k, (sample.at[k] - begun[k]) / scales[k], ends, scales[k])
         if not remark and not settled and np.isfinite(newton[k]):
@@ -430,6 +429,21 @@ def _has_no_skill(sample: _Sample, k: int, scale: float, ends: Sequence[float | 
         losses.append(math.nan if values is None else sample.shares @ values)
         slopes.append(scale * sample.mean_slope(at)[k])
     return gradient_skill(steps, losses, slopes) < MIN_SKILL
+
+
+def _follow_loss(
+    sample: _Sample, objective: Callable[[float], NDArray[np.float64] | None]
+) -> list[float | None]:
+    """Find both ends of an interval by following the loss, see `_find_interval_end`.
+
+    Args:
+        sample: The loss of all parts.
+        objective: Function of a step that returns the losses (parts,), None outside the bounds.
+
+    Returns:
+        The ends, unit steps.
+    """
+    return [_find_interval_end(sample, objective, sign) for sign in (-1.0, 1.0)]
 
 
 def _smoothed_ends(

@@ -32,6 +32,7 @@ MIN_GAP_US = 2000
 MIN_GAP_INTERVALS = 50
 N_MEAN_INTERVALS = 256  # number over which intervals are averaged
 FIRST_INTERVAL_NS = 1_000_000
+ANY_FLOW = np.array([0, 0, np.inf])[:, None, None]  # gate that lets all candidates in
 MAX_GAP_FRACTION = 0.5  # of the range of ages, from which an event says nothing
 
 Numeric = Array | np.ndarray
@@ -195,16 +196,16 @@ class CandidateSampler:
         Args:
             until: The time, us, of the first event that may be scored.
         """
-        never = np.array([[[1]], [[0]]]), np.array([0, 0, np.inf])[:, None, None]
+        no_ages = np.array([[[1]], [[0]]])
         rules = BatchRules(
-            *never, 0.0, -NEVER_US, self.longest, -NEVER_US, self.radius, self.silence
+            no_ages, ANY_FLOW, 0.0, -NEVER_US, self.longest, -NEVER_US, self.radius, self.silence
         )
-        stop = self.recording.events.index(until)
+        unused, stop = self._make_arrays(1), self.recording.events.index(until)
         while self._row < stop:
             events = self.recording.events[self._row : min(self._row + EVENTS_PER_READ, stop)]
             stream = EventStream(events.t, events.x, events.y, events.p, 1)
-            out, cursor = self._make_arrays(1), np.array([0, 0, 0, -NEVER_US])
-            _fill_batches(stream, rules, self._recent, out, cursor, self._clock)
+            cursor = np.array([0, 0, 0, -NEVER_US])
+            _fill_batches(stream, rules, self._recent, unused, cursor, self._clock)
             self._row += len(events)
             self._last = int(events.t[-1])
 
@@ -253,7 +254,7 @@ class CandidateSampler:
         limits = np.stack([np.maximum(1, np.ceil(young)), np.floor(old)])
         limits = np.minimum(limits, -NEVER_US / 2).astype(np.int64)
         if expected is None:
-            gate, margin = np.array([0, 0, np.inf])[:, None, None], 0.0
+            gate, margin = ANY_FLOW, 0.0
         else:
             gate = np.concatenate([expected.U, expected.slack[None]]).astype(np.float64, order="C")
             margin = expected.margin

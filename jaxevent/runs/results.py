@@ -194,7 +194,7 @@ def open_results(folder: Path) -> Iterator[Write]:
 
 
 INTERVAL_COLUMNS = ("method", "parameter", "start", "found", "95 % interval", "unit", "")
-MIN_TOLD_LOSS = 0.01  # share of the time that a fit loses beside what was lost before
+MIN_TOLD_LOST_SHARE = 0.01  # of the time, lost beside what was lost before the fit
 INDEPENDENT_MEASUREMENTS = "measurements, taken as independent"
 
 
@@ -313,7 +313,7 @@ def format_findings(found: Sequence[Mapping[str, Any]], gained: Sequence[Mapping
         pair = f"{one['before']:.4g} before, {one['after']:.4g} after"
         # An error is that of what is estimated: a fit may lower it by estimating less.
         before, after = one.get("lost") or (0.0, 0.0)
-        if after >= before + MIN_TOLD_LOSS:
+        if after >= before + MIN_TOLD_LOST_SHARE:
             change += f", but {100 * after:.0f} % of the time is lost, {100 * before:.0f} % before"
         lines.append(f"\nGain of {one['method']}: {one['measure']} of {seen} {pair}{change}.\n")
     return "".join(lines)

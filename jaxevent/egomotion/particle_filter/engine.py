@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.codegen.derivative import DerivativeDirections
+from jaxevent.codegen.derivative import DerivativeDirections, with_derivatives
 from jaxevent.codegen.graph import Graph, Level, Node, ParameterProgram, TranslationError
 from jaxevent.codegen.module import KernelCache
 from jaxevent.codegen.trace import (
@@ -291,7 +291,6 @@ class FunctionTracer:
         Returns:
             The results, with derivatives.
         """
-        params, _, seeds = known
         plain = {key: value for key, value in values.items() if key not in of_inputs}
         at = {
             name: plain[key] if field is None else getattr(plain[key], field)
@@ -306,7 +305,7 @@ class FunctionTracer:
             for name, v in at.items()
         }
 
-        def compute(params: Any, at: dict[str, Any]) -> tuple[Any, Any]:
+        def compute(known: Any, **at: Any) -> dict[str, Any]:
             given = dict(plain)
             for name, (key, field) in of_inputs.items():
                 given[key] = (
@@ -314,17 +313,16 @@ class FunctionTracer:
                     if field is None
                     else dataclasses.replace(given[key], **{field: at[name]})
                 )
-            made = function(params, **given)
-            names = self._tangent_names(moved, made)
+            return function(known[0], **given)
+
+        def select(made: dict[str, Any]) -> dict[str, Any]:
             return {
                 name: made[key] if field is None else getattr(made[key], field)
-                for name, (key, field) in names.items()
-            }, made
+                for name, (key, field) in self._tangent_names(moved, made).items()
+            }
 
-        def push(seeds: Any, changes: Any) -> Any:
-            return jax.jvp(compute, (params, at), (seeds, changes), has_aux=True)[1:]
-
-        slopes, made = jax.vmap(push, out_axes=(0, None))(seeds, changes)
+        made = with_derivatives(compute, select)(known, changes, **at)
+        slopes = made.pop("sensitivities")
         return made | slopes
 
     def _lay_out(

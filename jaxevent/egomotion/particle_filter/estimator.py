@@ -37,10 +37,7 @@ from jaxevent.egomotion.particle_filter import filtering
 from jaxevent.egomotion.particle_filter.engine import CompiledFilter, check_filter
 from jaxevent.egomotion.particle_filter.filtering import BatchInfo, ParticleState, RandomNumbers
 from jaxevent.egomotion.particle_filter.params import Params
-from jaxevent.egomotion.particle_filter.training import (
-    WarmStartedRuns,
-    training_spread,
-)
+from jaxevent.egomotion.particle_filter.training import WarmStartedRuns, training_spread
 from jaxevent.egomotion.patches import ImageSpeed, is_camera_known_to_move
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
