@@ -164,16 +164,18 @@ def track_by_norfair(
 def track_by_means(
     recording: Recording, found: TargetSearchResult, truth: BlobTruth, times: NDArray[np.int64]
 ) -> Positions:
-    """Follow each target by a centred mean, from its true position at the first time."""
-    states = truth(times)
-    states = states[:, (states[..., 4] > 0.5).any(0)]
+    """Follow each target by a centred mean, from its true position where it is first seen."""
+    states, size = truth(times), (recording.width, recording.height)
+    inside = ((states[..., :2] >= 0) & (states[..., :2] < size)).all(-1)
+    seen = inside & truth.visible(times) & (states[..., 4] > 0.5).any(0)
     lines, events = [], recording.events
     window = round(1e6 * found.passes[0].selection.scale.window) if found.passes else 10_000
-    for k in range(states.shape[1]):
-        p, line = states[0, k, :2], _Line([], [])
-        for t in range(int(times[0]), int(times[-1]), max(window // 2, 1)):
+    for k in np.flatnonzero(seen.any(0)):
+        first, line = seen[:, k].argmax(), _Line([], [])
+        p, reach = states[first, k, :2], 3 * states[first, k, 4]
+        for t in range(int(times[first]), int(times[-1]), max(window // 2, 1)):
             part = events[events.index(t - window // 2) : events.index(t + window // 2)]
-            near = np.hypot(part.x - p[0], part.y - p[1]) < 3 * states[0, k, 4]
+            near = np.hypot(part.x - p[0], part.y - p[1]) < reach
             if near.sum() >= 3:
                 p = np.array([part.x[near].mean(), part.y[near].mean()])
             line.t.append(t)
