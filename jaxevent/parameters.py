@@ -19,6 +19,7 @@ from jaxtyping import Array
 from jaxevent.deprecated import RenamedAttribute, renamed_names
 from jaxevent.display import describe_type
 from jaxevent.errors import InputError, InputWarning
+from jaxevent.precision import to_jax
 from jaxevent.threads import check_platform_available
 
 Numeric = float | Array | np.ndarray | np.number  # a number, or a traced one
@@ -365,7 +366,7 @@ class Parameters(_ParameterArrays):
             for name, choice in self.choices.items()
         )
         self.added_derivatives = frozenset()
-        self.homogeneous = jnp.asarray(np.ones((), jnp.result_type(float)))
+        self.homogeneous = to_jax(np.ones(()))
 
     @classmethod
     def settings(cls) -> dict[str, Setting]:
@@ -672,8 +673,7 @@ def _apply_elementwise(name: str, values: Array) -> Array:
     # Logarithms of 0 and overflowing exponentials are expected.
     with np.errstate(divide="ignore", over="ignore"):
         known = np.asarray(known_by(np.asarray(values)))
-    # Without a dtype JAX compiles a copy.
-    return jnp.asarray(known, jax.dtypes.canonicalize_dtype(known.dtype))
+    return to_jax(known)
 
 
 def _to_python(value: Any) -> Any:
