@@ -110,7 +110,7 @@ MUTATIONS = (
     Mutation(
         "steps lead prepared numbers away",
         "jaxevent/parameters.py",
-        "return self.physical(raw if follows else jax.lax.stop_gradient(raw))",
+        "return self.physical(jax.lax.stop_gradient(raw) if stops else raw)",
         "return self.physical(raw)",
         "tests/test_notebook.py -k all_leaves",
     ),

@@ -1,4 +1,4 @@
-"""Compiled programs are kept in the user's cache folder, for later processes.
+"""Caches: compiled programs in the user's folder, for later processes, and results of methods.
 
 Compiling takes seconds, running often less. So `import jaxevent` tells JAX to keep programs that
 took longer than `MIN_COMPILE_SECONDS` to compile. JAX's own settings win:
@@ -20,8 +20,12 @@ import platform
 import sys
 import tempfile
 import warnings
+import weakref
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 MIN_COMPILE_SECONDS = 0.3  # s; shorter compilations are not worth a file
 
@@ -57,6 +61,29 @@ def keep_compiled() -> Path | None:
     # What cannot be kept, was damaged, or is being written by another process is compiled again.
     warnings.filterwarnings("ignore", "Error (read|writ)ing persistent compilation cache")
     return folder
+
+
+def cache_method(method: Callable[..., T], size: int) -> Callable[..., T]:
+    """Cache a bound method's latest results, by its arguments, for the object that it is bound to.
+
+    An object with `functools.lru_cache` of a method of its own refers to itself. So what it holds,
+    often gigabytes, would stay in memory until Python next looks for cycles.
+
+    Args:
+        method: The bound method.
+        size: Number of results.
+
+    Returns:
+        The function, which does not keep the object alive.
+    """
+    bound: Any = method
+    owner, function = weakref.ref(bound.__self__), bound.__func__
+
+    @functools.lru_cache(size)
+    def latest(*args: Any) -> T:
+        return function(owner(), *args)
+
+    return latest
 
 
 def folder_for_compiled() -> Path | None:

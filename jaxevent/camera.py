@@ -25,6 +25,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.errors import InputError
+from jaxevent.precision import to_jax
 
 _LARGEST_SENSOR = (1 << 16, 1 << 16)  # px: coordinates of events are uint16
 _MAX_TAN_ANGLE = 20.0  # tan of the widest angle from the axis that is supported, 87 degrees
@@ -186,7 +187,7 @@ class UnknownResponse(Response):
         return jnp.clip(jnp.asarray(intensity), 0, 1)
 
     def intensity(self, grey: Values) -> Float[Array, "..."]:
-        return jnp.asarray(grey)
+        return to_jax(grey)
 
     def certainty(self, grey: Values) -> Float[Array, "..."]:
         grey = jnp.asarray(grey)

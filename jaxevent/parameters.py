@@ -19,8 +19,10 @@ from jaxtyping import Array
 from jaxevent.deprecated import RenamedAttribute, renamed_names
 from jaxevent.display import describe_type
 from jaxevent.errors import InputError, InputWarning
+from jaxevent.precision import to_jax
 from jaxevent.threads import check_platform_available
 
+A = TypeVar("A", Array, np.ndarray)
 Numeric = float | Array | np.ndarray | np.number  # a number, or a traced one
 T = TypeVar("T", bound="Parameters")
 S = TypeVar("S", bound="Setting")
@@ -99,14 +101,15 @@ class Number(Setting):
             )
         raw = instance.raw[self.name]
         follows = self.gradient or self.name in instance.added_derivatives
-        return self.physical(raw if follows else jax.lax.stop_gradient(raw))
+        stops = isinstance(raw, Tracer) and not follows
+        return self.physical(jax.lax.stop_gradient(raw) if stops else raw)
 
     if TYPE_CHECKING:  # type of the argument of a `Params` class
 
         def __set__(self, instance: Any, value: Numeric | Sequence[Numeric]) -> None: ...
 
-    def physical(self, raw: Array) -> Array:
-        """Convert the stored number to the value."""
+    def physical(self, raw: A) -> A:
+        """Convert the stored number to the value, by NumPy where it is one of NumPy."""
         return raw
 
     def unconstrained(self, value: Array) -> Array:
@@ -162,7 +165,7 @@ class Positive(Number):
 
     lower = 0.0
 
-    def physical(self, raw: Array) -> Array:
+    def physical(self, raw: A) -> A:
         return _apply_elementwise("exp", raw)
 
     def unconstrained(self, value: Array) -> Array:
@@ -172,7 +175,7 @@ class Positive(Number):
 class UnitInterval(Number):
     """A number in [0, 1), stored as ln(p / (1 - p)), so that 0 is stored as -inf and stays 0."""
 
-    def physical(self, raw: Array) -> Array:
+    def physical(self, raw: A) -> A:
         return _apply_elementwise("sigmoid", raw)
 
     def unconstrained(self, value: Array) -> Array:
@@ -365,7 +368,7 @@ class Parameters(_ParameterArrays):
             for name, choice in self.choices.items()
         )
         self.added_derivatives = frozenset()
-        self.homogeneous = jnp.asarray(np.ones((), jnp.result_type(float)))
+        self.homogeneous = to_jax(np.ones(()))
 
     @classmethod
     def settings(cls) -> dict[str, Setting]:
@@ -645,6 +648,24 @@ class Parameters(_ParameterArrays):
         return {name: value for name, value in found.items() if name not in THRESHOLDS}
 
 
+def read_float(params: Any, name: str, default: float = 0.0) -> float:
+    """Read a number of parameters, many times as fast as by way of its JAX array.
+
+    Args:
+        params: `Parameters`, or another object.
+        name: Name of the number.
+        default: Value where there is no such attribute.
+
+    Returns:
+        The value.
+    """
+    if not isinstance(params, Parameters) or name not in params.numbers or params.is_gradient:
+        return float(getattr(params, name, default))
+    raw: Any = params.raw[name]
+    known = raw if isinstance(raw, Tracer) else np.asarray(raw)  # a traced one raises below
+    return float(params.numbers[name].physical(known))
+
+
 # Versions for NumPy and for JAX.
 _FUNCTIONS: Mapping[str, tuple[Callable, Callable]] = {
     "exp": (np.exp, jnp.exp),
@@ -654,17 +675,17 @@ _FUNCTIONS: Mapping[str, tuple[Callable, Callable]] = {
 }
 
 
-def _apply_elementwise(name: str, values: Array) -> Array:
+def _apply_elementwise(name: str, values: Any) -> Any:
     """Apply a function of `_FUNCTIONS` to each element, with NumPy unless values are traced.
 
     XLA would compile for 60 ms for each shape.
 
     Args:
         name: Name in `_FUNCTIONS`.
-        values: Array of any shape.
+        values: Array of any shape, of JAX or of NumPy.
 
     Returns:
-        Array of the same shape.
+        Array of the same shape and library.
     """
     known_by, traced_by = _FUNCTIONS[name]
     if isinstance(values, Tracer):
@@ -672,8 +693,7 @@ def _apply_elementwise(name: str, values: Array) -> Array:
     # Logarithms of 0 and overflowing exponentials are expected.
     with np.errstate(divide="ignore", over="ignore"):
         known = np.asarray(known_by(np.asarray(values)))
-    # Without a dtype JAX compiles a copy.
-    return jnp.asarray(known, jax.dtypes.canonicalize_dtype(known.dtype))
+    return known if isinstance(values, np.ndarray) else to_jax(known)
 
 
 def _to_python(value: Any) -> Any:

@@ -6,6 +6,10 @@ from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
 
 Q = ParamSpec("Q")
 T = TypeVar("T")
@@ -20,6 +24,18 @@ def full_precision(function: Callable[Q, T]) -> Callable[Q, T]:
             return function(*args, **kwargs)
 
     return precise
+
+
+def to_jax(values: ArrayLike | Array) -> Array:
+    """Convert numbers to a JAX array of JAX's own precision, without compiling a program.
+
+    `jnp.asarray` compiles one for each shape, for 60 ms, unless values have the type that they get.
+    """
+    if isinstance(values, Array):
+        return values
+    known = np.asarray(values)
+    real = jax.dtypes.canonicalize_dtype(known.dtype)
+    return jnp.asarray(known.astype(real, copy=False), real)
 
 
 def double_precision(enabled: bool) -> contextlib.AbstractContextManager[Any]:

@@ -1,5 +1,6 @@
 """The contract: arguments that are refused in a sentence, results that are tuples."""
 
+import gc
 import pathlib
 
 import jax
@@ -132,3 +133,22 @@ def test_methods_show_their_names_and_suggest_one():
     with pytest.raises(InputError, match="there is no method 3; known: akf"):
         jaxevent.METHODS[3]
     assert "afk" not in jaxevent.METHODS and jaxevent.METHODS.get("afk") is None
+
+
+@pytest.mark.parametrize("name", ["mc", "events-only"])
+def test_images_leave_no_cycles(name, recording):
+    """Cycles would hold the memory of a recording until Python next looks for them."""
+    images = jaxevent.METHODS[name].estimate(recording)
+    images([recording.start + 20_000])
+    gc.collect()
+    gc.disable()
+    gc.set_debug(gc.DEBUG_SAVEALL)
+    try:
+        del images
+        gc.collect()
+        cycles = [type(one) for one in gc.garbage if type(one).__module__.startswith("jaxevent")]
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.enable()
+    assert not cycles

@@ -11,6 +11,7 @@ import pytest
 import jaxevent
 from jaxevent.errors import InputError
 from jaxevent.parameters import Count, Number, Parameters, Positive, UnitInterval
+from jaxevent.precision import to_jax
 
 
 class Given(Parameters):
@@ -196,3 +197,16 @@ def test_a_repr_shows_few_of_many_numbers():
     # A change of a number that is not shown is a change.
     changed = params.replace(choice=[*weights[:-1], weights[-1] + 1])
     assert repr(changed).startswith("Params(choice=[")
+
+
+def test_numbers_become_jax_arrays_without_a_program(caplog):
+    """JAX compiles a program for each shape that it converts itself."""
+    values = np.arange(7 * 13.0).reshape(7, 13)  # a shape that no other test converts
+    with jax.log_compiles():
+        converted = to_jax(values)
+        assert "Compiling" not in caplog.text
+        jnp.asarray(values)
+        assert "Compiling" in caplog.text
+    assert isinstance(converted, jax.Array) and converted.dtype == jnp.result_type(float)
+    np.testing.assert_array_equal(converted, values)
+    assert to_jax(converted) is converted and to_jax(2).dtype == jnp.result_type(int)

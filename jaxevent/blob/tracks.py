@@ -18,6 +18,7 @@ from jaxevent.blob.shape import N_SHAPE_TIMES, UsualSizes, fit_usual_sizes, shap
 from jaxevent.blob.track import TrackStates, track_params
 from jaxevent.display import HtmlRepr
 from jaxevent.errors import InputError
+from jaxevent.precision import to_jax
 from jaxevent.progress import bar
 from jaxevent.recording import Times, microseconds
 from jaxevent.threads import TurnLock
@@ -207,7 +208,7 @@ class Tracks(HtmlRepr):
         Returns:
             The parameters.
         """
-        own = {name: jnp.asarray(values[id]) for name, values in self._packer.overrides.items()}
+        own = {name: to_jax(values[id]) for name, values in self._packer.overrides.items()}
         return track_params(self.params, own)
 
     @property

@@ -467,16 +467,15 @@ def evaluate_equation(eqn: Any, values: list[NDArray]) -> list[NDArray]:
         Arrays for its results.
     """
     name = eqn.primitive.name
-    called = called_jaxpr(eqn)
+    known = ELEMENTWISE_FUNCTIONS.get(name)
+    called = called_jaxpr(eqn) if known is None else None
     if called is not None:
         return evaluate_jaxpr(called, values)
     if name == "scan":
         return _scan(eqn, values)
     with np.errstate(all="ignore"):
-        made = move_elements(eqn, values)
-        if made is None and name in ELEMENTWISE_FUNCTIONS:
-            made = ELEMENTWISE_FUNCTIONS[name](*values)
-        elif made is None and name == "div":
+        made = move_elements(eqn, values) if known is None else known(*values)
+        if made is None and name == "div":
             whole = np.asarray(values[0]).dtype.kind in "iu"
             made = values[0] // values[1] if whole else values[0] / values[1]
         elif made is None and name == "integer_pow":

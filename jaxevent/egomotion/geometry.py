@@ -32,7 +32,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxevent.camera import PinholeCamera
 from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
-from jaxevent.precision import full_precision
+from jaxevent.precision import full_precision, to_jax
 
 Scalars = Float[Array | np.ndarray, "..."] | float | int
 
@@ -409,7 +409,7 @@ def _replace_nonfinite(value: Array) -> Array:
 
 
 def _as_float(value: ArrayLike | float | int) -> Array:
-    value = jnp.asarray(value)
+    value = to_jax(value)
     return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(float)
 
 

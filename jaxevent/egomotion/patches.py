@@ -35,7 +35,7 @@ from jaxevent.camera import PinholeCamera
 from jaxevent.codegen import njit_noalloc
 from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
 from jaxevent.egomotion.candidates import pixel_coordinates
-from jaxevent.egomotion.geometry import A, rotation_basis
+from jaxevent.egomotion.geometry import rotation_basis
 from jaxevent.egomotion.models import Model, Planar, Rotation
 from jaxevent.recording import Imu, Recording
 
@@ -681,7 +681,10 @@ def _translation_basis(xi: NDArray[np.float64], f: float) -> NDArray[np.float64]
     Returns:
         (n, 2, 3).
     """
-    return np.stack([np.asarray(A(x, y, f)) for x, y in xi])
+    columns = np.zeros((len(xi), 2, 3))
+    columns[:, 0, 0] = columns[:, 1, 1] = -f
+    columns[:, :, 2] = xi
+    return columns
 
 
 def fit_general(window: PatchSharpness, f: float, turn: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,12 +1,12 @@
 """Dense optical flow of a recording's events, as a function of time."""
 
-import functools
 import threading
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.cache import cache_method
 from jaxevent.calibration.event_calibration import remove_many_hot_events
 from jaxevent.errors import InputError
 from jaxevent.event_flow.alignment import (
@@ -99,8 +99,8 @@ class EventFlow:
         pixels = self.shape[0] * self.shape[1]
         self._base = max(round(float(params.density) * pixels), 2 ** -LEVELS[0])  # events
         self._align = Alignment(self.shape, params)
-        self._chain = functools.lru_cache(N_CACHED_ANCHORS)(self._make_chain)
-        self._anchor = functools.lru_cache(N_CACHED_ANCHORS)(self._make_anchor)
+        self._chain = cache_method(self._make_chain, N_CACHED_ANCHORS)
+        self._anchor = cache_method(self._make_anchor, N_CACHED_ANCHORS)
         self._lock = threading.RLock()
 
     def __repr__(self) -> str:

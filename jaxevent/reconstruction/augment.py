@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
@@ -75,7 +76,10 @@ class FrameParams(Parameters):
     @property
     def frame_delay(self) -> Any:
         """Time added to the frames' stamps to be beside the events that show the same, s."""
-        return self.clock_offset + self.event_delay
+        offset, delay = self.clock_offset, self.event_delay
+        if isinstance(offset, Tracer) or isinstance(delay, Tracer):
+            return offset + delay
+        return np.add(offset, delay)  # for which JAX would compile a program
 
     def beside_events(self: T) -> T:
         """Return the parameters with the frames' clock moved by the delay, for times of events."""

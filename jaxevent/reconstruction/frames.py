@@ -4,13 +4,17 @@ import dataclasses
 import functools
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.calibration.clipping import find_clipping
-from jaxevent.codegen import njit
+from jaxevent.camera import Response
+from jaxevent.codegen import njit, read_only
 from jaxevent.codegen.graph import evaluate_function
 from jaxevent.events.live import Tail
+from jaxevent.parameters import read_float
 from jaxevent.reconstruction.features import (
     ExposureSegments,
     FrameFeatures,
@@ -43,7 +47,7 @@ class EventTiming(NamedTuple):
     @classmethod
     def of(cls, params: Any) -> "EventTiming":
         """Read an estimator's parameters, rounded to 10 ns: float32 has 7.5 ms as 7500 us too."""
-        return cls(**{n: round(float(getattr(params, n, 0.0)), 8) for n in cls._fields})
+        return cls(**{name: round(read_float(params, name), 8) for name in cls._fields})
 
     @property
     def frame_delay(self) -> float:
@@ -236,17 +240,43 @@ def _position(breaks: NDArray, i: NDArray, time: NDArray) -> NDArray:
     return np.where(inside, (time - breaks[j]) * interval_rates(breaks)[j], 0)
 
 
+class ResponseTables:
+    """Tables of a camera's response; those of equal responses are evaluated once."""
+
+    def __init__(self, response: Response):
+        self._response = response
+        leaves, tree = jax.tree.flatten(response)
+        arrays = [np.asarray(leaf) for leaf in leaves]
+        double = jnp.result_type(float) == np.float64
+        self._key = tree, double, tuple((a.dtype.str, a.shape, a.tobytes()) for a in arrays)
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ResponseTables) and self._key == other._key
+
+    def evaluate(self, grey: NDArray) -> NDArray:
+        """Return grey values, intensities and certainties [3, ...] of grey values in [0, 1]."""
+        functions = (lambda grey: grey, self._response.intensity, self._response.certainty)
+        return np.stack([evaluate_function(function, grey) for function in functions])
+
+    @functools.lru_cache(maxsize=8)  # noqa: B019 - equal ones share it, and hold a table
+    def of_levels(self, count: int) -> NDArray:
+        """Evaluate (3, count) evenly spaced grey values."""
+        return read_only(self.evaluate(np.arange(count) / max(count - 1, 1)))
+
+
 class FrameImages:
     """The frames of a recording as grey values, intensities and certainties of type `dtype`."""
 
     def __init__(self, recording: Recording, dtype: np.dtype):
         self.recording, self.dtype = recording, dtype
-        response, self._gain = recording.response, recording.gain
-        self._tables = (lambda grey: grey, response.intensity, response.certainty)
+        self._response, self._gain = ResponseTables(recording.response), recording.gain
 
     def response(self) -> NDArray:
         """Return the intensities of 256 evenly spaced grey values."""
-        return evaluate_function(self._tables[1], np.linspace(0, 1, 256)).astype(self.dtype)
+        return self._response.of_levels(256)[1].astype(self.dtype)
 
     @functools.cached_property
     def white(self) -> NDArray | None:
@@ -262,12 +292,11 @@ class FrameImages:
         assert self.recording.frames is not None
         kind = self.recording.frames.images.dtype
         levels = 1 + (np.iinfo(kind).max if kind.kind in "iu" else 0)
-        return self.values(np.arange(levels) / max(levels - 1, 1))
+        return self._response.of_levels(levels).astype(self.dtype)
 
     def values(self, images: NDArray) -> NDArray:
         """Return grey values, intensities and certainties [3, ...] of images in [0, 1]."""
-        made = [evaluate_function(table, images).astype(self.dtype) for table in self._tables]
-        return np.stack(made)
+        return self._response.evaluate(images).astype(self.dtype)
 
     def read(self, frame_range: slice, capacity: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Read a range of frames.

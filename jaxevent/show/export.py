@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.codegen import N_THREADS
+from jaxevent.codegen import N_THREADS, map_ahead
 from jaxevent.display import format_span
 from jaxevent.errors import InputError, InputWarning
 from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5, deflate_shuffled
@@ -19,7 +19,7 @@ from jaxevent.progress import bar
 from jaxevent.reconstruction.colour import apply_chrominance, chrominance, luminance
 from jaxevent.reconstruction.video import N_BATCH_IMAGES, ImageSequence
 from jaxevent.recording import Recording, Times, microseconds
-from jaxevent.show.images import Tone, display_limits, tone_map, video_writer, write_png
+from jaxevent.show.images import Tone, display_limits, encode_png, tone_map, video_writer
 
 MAX_IMAGES = 10_000_000  # times of one command: 80 MB, a day of 100 per second
 
@@ -275,14 +275,20 @@ def _write_images(video: ImageSequence, times: NDArray, out: Path, options: Expo
     """
     range_used = RangeCounter(options.tone)
     with complete(out, directory=True) as partial:
-        lines = []
-        for number, (at, image) in enumerate(
-            display_images(video, times, options.tone, options.colours)
-        ):
-            range_used.add(image)
+
+        def counted() -> Iterator[tuple[int, tuple[int, NDArray[np.uint8]]]]:
+            shown = display_images(video, times, options.tone, options.colours)
+            for numbered in enumerate(shown):
+                range_used.add(numbered[1][1])
+                yield numbered
+
+        def write(numbered: tuple[int, tuple[int, NDArray[np.uint8]]]) -> str:
+            number, (at, image) = numbered
             file = f"frame_{number:08d}.png"
-            write_png(partial / file, image)
-            lines.append(f"{at / 1e6:.6f} {file}\n")
+            encode_png(partial / file, image)
+            return f"{at / 1e6:.6f} {file}\n"
+
+        lines = list(map_ahead(write, counted()))  # compressed on all cores
         (partial / "images.txt").write_text("".join(lines))
     return str(range_used)
 

@@ -205,11 +205,21 @@ def write_png(path: str | Path, image: NDArray) -> None:
     Raises:
         InputError: The array is another one.
     """
-    from PIL import Image
-
     _check_displayable(path, image)
     with complete(Path(path)) as temporary:
-        Image.fromarray(np.ascontiguousarray(image)).save(temporary, format="PNG")
+        encode_png(temporary, image)
+
+
+def encode_png(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write an image as a PNG file, in a folder that is not complete yet.
+
+    Args:
+        path: File that is written.
+        image: uint8, grey (height, width) or colour (height, width, 3).
+    """
+    from PIL import Image
+
+    Image.fromarray(np.ascontiguousarray(image)).save(path, format="PNG")
 
 
 @contextlib.contextmanager

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +20,7 @@ from PIL import Image, ImageDraw, ImageFont
 from jaxevent.blob.quantities import SIZE_FACTORS, inverse_ttc, inverse_ttc_from_size, size_range
 from jaxevent.errors import InputError
 from jaxevent.events import count_events
+from jaxevent.precision import to_jax
 from jaxevent.recording import Recording, Times
 from jaxevent.show.images import COLOURS, new_figure, save_figure
 from jaxevent.show.track_tables import check_tracks
@@ -282,7 +282,7 @@ def write_track_plot(
     )  # fmt: skip
     filled = np.where(valid[..., None], mean, 1.0)
     filled_P = np.where(valid[..., None, None], covariance, np.eye(8))
-    m, P = jnp.asarray(filled), jnp.asarray(filled_P)
+    m, P = to_jax(filled), to_jax(filled_P)
     noise = None if Q_lambda is None else np.asarray(Q_lambda, m.dtype)[shown]
     grown, spread, grows = _growths(t, m, P, valid, Q, noise, smoothed=smoothed)
     sizes = filled[..., 4:6], np.diagonal(filled_P, axis1=2, axis2=3)[..., 4:6]
@@ -417,13 +417,15 @@ def _growths(
     Returns:
         1 / TTC (T, N), 1/s, its variance, and the tracks (N,) where it is significantly not 0.
     """
-    since = jnp.asarray((t - t[0]) * 1e-6, m.dtype)
+    since = to_jax(((t - t[0]) * 1e-6).astype(m.dtype))
     one = functools.partial(inverse_ttc_from_size, since, Q=Q, smoothed=smoothed)
-    grown, spread = jax.vmap(
+    all_tracks = jax.vmap(
         lambda m, P, seen, noise: one(m, P, seen, Q_lambda=noise),
         in_axes=(1, 1, 1, None if Q_lambda is None else 0),
         out_axes=1,
-    )(m, P, jnp.asarray(valid), Q_lambda)
+    )
+    # Compiled as one program, not as one for each step outside of `inverse_ttc_from_size`.
+    grown, spread = jax.jit(all_tracks)(m, P, valid, Q_lambda)
     grown, spread = np.asarray(grown, np.float64), np.asarray(spread, np.float64)
     clear = valid & (np.abs(grown) > _GROWTH_SIGMAS * np.sqrt(np.maximum(spread, 0)))
     return grown, spread, clear.sum(0) > _GROWTH_SHARE * np.maximum(valid.sum(0), 1)

@@ -9,7 +9,6 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,6 +26,7 @@ from jaxevent.blob.search.window_tracker import WindowTracker
 from jaxevent.blob.seeds import tracking_span
 from jaxevent.deprecated import RenamedAttribute
 from jaxevent.display import plural
+from jaxevent.precision import to_jax
 from jaxevent.progress import stage
 from jaxevent.recording import Recording, check_recording
 
@@ -204,7 +204,7 @@ class TargetSearchResult:
             return {name: value[self.index] for name, value in values.items()}
         for name, values in self._target_values().items():
             if np.isclose(float(getattr(params, name)), usual[name], rtol=1e-5):
-                stored = jnp.asarray(values, params.raw[name].dtype)
+                stored = to_jax(np.asarray(values, params.raw[name].dtype))
                 out[name] = np.asarray(getattr(type(params), name).unconstrained(stored))
         return out
 

@@ -21,6 +21,7 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
+from jaxevent.cache import cache_method
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.bundle.alignment import WindowEvents, align_segments, contrast_score
 from jaxevent.egomotion.bundle.initialise import (
@@ -193,7 +194,7 @@ class WindowFitter(WindowReader):
     @functools.cached_property
     def rotation(self) -> Callable[[int], NDArray[np.float64]]:
         """The function of a window's centre that returns its rotation; it keeps the latest two."""
-        return functools.lru_cache(2)(self._find_rotation)
+        return cache_method(self._find_rotation, 2)
 
     def _find_rotation(self, centre: int) -> NDArray[np.float64]:
         """Return the rotation (3,), rad/s, at the middle of a window, by a gyro if there is one."""

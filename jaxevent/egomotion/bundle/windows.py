@@ -21,6 +21,7 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
+from jaxevent.cache import cache_method
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion.bundle.alignment import WindowEvents
 from jaxevent.egomotion.bundle.residuals import PixelSeries
@@ -317,7 +318,7 @@ class WindowReader:
         self.lens = lens_error(camera)
         self.sigma_floor: dict[int, float] = {}  # C, least sigma, by centres
         # Stages read the same window one after another.
-        self.read_frame_pixels = functools.lru_cache(2)(self._read_frame_pixels)
+        self.read_frame_pixels = cache_method(self._read_frame_pixels, 2)
         self.real = np.dtype(jax.dtypes.canonicalize_dtype(float))
         self.xi, self.f = pixel_coordinates(recording.width, recording.height, camera)
         flat = self.xi.reshape(-1, 2)

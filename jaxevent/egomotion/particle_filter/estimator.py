@@ -727,7 +727,7 @@ def _basis_at(model: Model, xi: NDArray[np.floating]) -> NDArray[np.floating]:
     Returns:
         (..., 2, d).
     """
-    return np.asarray(model.basis(jnp.asarray(xi.astype(np.dtype(jnp.result_type(float))))))
+    return np.asarray(model.basis(xi.astype(np.dtype(jnp.result_type(float)))))
 
 
 def adapt_lengths(params: Params, speed: ImageSpeed) -> dict[str, float]:

@@ -22,7 +22,7 @@ from jaxevent.codegen import map_ahead
 from jaxevent.deprecated import RenamedAttribute, renamed_names
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, ShortRepr
-from jaxevent.precision import with_own_settings
+from jaxevent.precision import to_jax, with_own_settings
 from jaxevent.reconstruction.compensated.event_noise import (
     IntervalNoise,
     inflate_variances,
@@ -277,7 +277,8 @@ class CompensatedVideo(ImageSequence[Params]):
             fused = constrain_image(self.params, fused, model, samples)
         if target.smooth is not None:
             return fused
-        return dataclasses.replace(fused, P=fused.P + brightness.variance)
+        P = np.asarray(fused.P)
+        return dataclasses.replace(fused, P=to_jax(P + P.dtype.type(brightness.variance)))
 
     def _read(self, times: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Any]]:
         for n, (_, fused) in enumerate(self._each(times.tolist())):

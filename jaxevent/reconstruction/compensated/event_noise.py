@@ -138,8 +138,9 @@ class EventNoise:
         if self._images.factors is not None:
             counts = counts * self._images.factors
         on, off = _share_out(counts.reshape(2, *size), float(params.share))
-        up, down = float(params.c_on) * on, float(params.c_off) * off
-        steps = float(params.sigma_event) ** 2 * (params.c_on * up + params.c_off * down)
+        c_on, c_off = float(params.c_on), float(params.c_off)
+        up, down = c_on * on, c_off * off
+        steps = float(params.sigma_event) ** 2 * (c_on * up + c_off * down)
         drift = float(params.sigma_bg) ** 2 * (end - begin) * 1e-6
         both = clear[0] * clear[1]
         e = both * (L[1] - L[0] - (up - down)).astype(np.float32)

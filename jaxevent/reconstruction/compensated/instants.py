@@ -15,8 +15,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import Akima1DInterpolator
 
+from jaxevent.cache import cache_method
 from jaxevent.calibration.gaps import Gaps, find_gaps
 from jaxevent.codegen import njit_noalloc
 from jaxevent.reconstruction.compensated.warp import PathTimes
@@ -50,7 +50,7 @@ class MissedEvents:
 
     def __init__(self, recording: Recording, block_us: int):
         self._events, self._origin, self._block = recording.events, recording.start, block_us
-        self._gaps = functools.lru_cache(N_CACHED_GAP_BLOCKS)(self._find_gaps)
+        self._gaps = cache_method(self._find_gaps, N_CACHED_GAP_BLOCKS)
 
     def __call__(self, times: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the events missing before times (us), beside a number common to all of them."""
@@ -254,7 +254,9 @@ class CommonMotion:
         return ((after - before) / (2e-6 * span)).astype(np.float32)
 
     @functools.cached_property
-    def _course(self) -> Akima1DInterpolator:
+    def _course(self) -> Callable[[NDArray], NDArray[np.float64]]:
+        from scipy.interpolate import Akima1DInterpolator  # imported in .4 s
+
         return Akima1DInterpolator((self.t - self.t[0]) * 1e-6, self.displacement)
 
     def _displacement_at(self, times: NDArray[np.int64]) -> NDArray[np.float64]:

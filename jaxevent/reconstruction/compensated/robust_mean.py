@@ -132,7 +132,7 @@ def squared_gradient(image: Array) -> Array:
     return gy**2 + gx**2
 
 
-def activity_range(layout: InstantLayout) -> tuple[Numeric, Numeric]:
+def activity_range(layout: InstantLayout) -> tuple[Numeric | np.integer, Numeric | np.integer]:
     """Return the indices between which changes are summed: the frames next to the target.
 
     Both are left out. Where frames are on one side alone, the range is from there to the target,
@@ -140,8 +140,8 @@ def activity_range(layout: InstantLayout) -> tuple[Numeric, Numeric]:
     """
     a, b, target = layout.before, layout.after, layout.target
     last = layout.s[a] <= 0  # no frame follows
-    low = jnp.where((a == b) & ~last, target - 1, a)
-    return low, jnp.where((a == b) & last, target + 1, b)
+    # No `jnp.where`, which compiles a program where the indices are known.
+    return a + ((a == b) & ~last) * (target - 1 - a), b + ((a == b) & last) * (target + 1 - b)
 
 
 def robust_mean_jax(
@@ -590,8 +590,9 @@ def robust_mean(
     weights = np.exp(-2 * layout.s**2).astype(np.float32)
     low, high = (int(k) for k in activity_range(layout))
     layout = layout._replace(target=target, before=int(layout.before), after=int(layout.after))
-    numbers = (p.information, p.floor, p.sigma_place**2, p.sigma_between**2, p.tolerance)
-    numbers = [np.float32(v) for v in numbers]
+    numbers = [np.float32(v) for v in (p.information, p.floor)]
+    numbers += [np.square(np.float32(v)) for v in (p.sigma_place, p.sigma_between)]
+    numbers.append(np.float32(p.tolerance))
     inputs = _MeanInputs(L, warped, layout, weights, taps, low, high, *numbers)
     rows, padded = empty_row_scratch(h, 10 + 2 * count, w), empty_row_scratch(h, w + len(taps))
     images = np.empty((3, h, w), np.float32)

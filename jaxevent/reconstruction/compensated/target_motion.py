@@ -5,7 +5,6 @@ from there to targets (`TrajectoryEstimator`). `fuse_target` makes the image of 
 """
 
 import dataclasses
-import functools
 import math
 from typing import Any, NamedTuple
 
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from jaxevent.cache import cache_method
 from jaxevent.errors import InputError
 from jaxevent.reconstruction.compensated.common_motion import estimate_common_motion
 from jaxevent.reconstruction.compensated.event_noise import EventNoise
@@ -309,12 +309,10 @@ class TrajectoryEstimator:
         self.exposures = FrameExposures(recording, params, self.schedule.speed)
         self.brightness = FrameBrightness(recording, self.schedule.frames, float(params.I0))
         self.event_noise = EventNoise(recording, params, images, self.schedule.frames)
-        cached = functools.lru_cache(N_CACHED_ANCHORS)  # by their times
-        self._anchor, self._anchor_motion = (
-            cached(self._make_anchor),
-            cached(self._estimate_anchor_motion),
-        )
-        self._frame_motion = cached(self._estimate_frame_motion)
+        # By their times.
+        self._anchor = cache_method(self._make_anchor, N_CACHED_ANCHORS)
+        self._anchor_motion = cache_method(self._estimate_anchor_motion, N_CACHED_ANCHORS)
+        self._frame_motion = cache_method(self._estimate_frame_motion, N_CACHED_ANCHORS)
         self._caution, self._cost = float(params.caution), CostParams.of(params)
         self._latest: tuple[NDArray[np.int64], Any] | None = None  # times, and images
         self._anchors: list[int] = []  # times of those whose images were read last, us

@@ -1,7 +1,8 @@
 """The windows of a recording's events: equations, and their solutions on the host."""
 
+import weakref
 from collections.abc import Callable, Iterable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,8 +64,9 @@ class WindowSolver:
         c = np.array([params.c_on, params.c_off], np.float32)
         self.thresholds = self.relative * c[:, None, None]
         self.numbers = SolverParams(*(float(value) for value in params.solver()))
+        itself: Any = weakref.proxy(self)  # lest both wait until cycles are collected
         self.memory = KeyMemories(
-            self,
+            itself,
             recording,
             self.n_side,
             silence=self.numbers.silence,
