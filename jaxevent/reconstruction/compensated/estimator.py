@@ -129,7 +129,8 @@ class PreparedTargets(ShortRepr):
 
     def take(self, rows: NDArray) -> "PreparedTargets":
         """Choose some of the images, in the order of `rows`."""
-        chosen = jax.tree.map(lambda leaf: leaf[rows], self.targets)
+        # By NumPy: JAX would compile a program for each shape.
+        chosen = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], self.targets)
         return PreparedTargets(self.instants, chosen, self.noise, self.samples)
 
 
