@@ -54,7 +54,7 @@ def window(
     cpu, clock = time.process_time() - cpu, time.perf_counter() - clock
     assert fit is not None
     T, Omega = source.twist(np.array([CENTRE]))
-    heading, turn = fit.path.twist(0.0)
+    heading, turn = fit.path.unit_twist(0.0)
     errors = np.concatenate([heading[0] - T[0] / np.linalg.norm(T), turn[0] - Omega[0]])
     squares = dict(zip(COMPONENTS, errors**2 / np.diag(fit.covariance), strict=True))
     spread = np.sqrt([np.trace(fit.covariance[:3, :3]), np.trace(fit.covariance[3:, 3:])])

@@ -466,7 +466,7 @@ def score_general(seed: int) -> dict[str, float]:
     T, Omega = source.twist(np.array([middle]))
     true = np.concatenate([T / np.linalg.norm(T), Omega], 1)
     assert fit is not None
-    mean = np.concatenate(fit.path.twist(0.0), 1)
+    mean = np.concatenate(fit.path.unit_twist(0.0), 1)
     told = Estimate(mean, fit.covariance[None], np.ones(1, bool))
     return score_rows(told, true)[0]
 

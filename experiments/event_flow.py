@@ -24,7 +24,7 @@ from tile_images import tile_scores
 import jaxevent
 from jaxevent.egomotion.baselines.planes import normal_flow
 from jaxevent.egomotion.candidates import pixel_coordinates
-from jaxevent.egomotion.truth import from_poses
+from jaxevent.egomotion.truth import twists_from_poses
 from jaxevent.simulate import SENSORS, MovingObjects, motion_scene, simulate
 
 SCENES = ("rotation", "slider", "braking", "shapes", "objects", "large")
@@ -197,7 +197,7 @@ def measure_slider():
     path = Path(os.environ.get("JAXEVENT_DATA", ".")) / "data" / "slider_depth.zip"
     recording = jaxevent.load(path)
     assert recording.poses is not None and recording.frames is not None
-    twists = from_poses(recording.poses, 0.05)
+    twists = twists_from_poses(recording.poses, 0.05)
     assert twists.T is not None
     xi, f = pixel_coordinates(recording.width, recording.height, recording.camera)
     jacobian = np.linalg.inv(np.stack([np.gradient(xi, axis=1), np.gradient(xi, axis=0)], -1))

@@ -586,7 +586,8 @@ class Frames:
             raise InputError(
                 f"{source}: frames have shape {self.images.shape} and {len(self.exposure)} "
                 f"exposures; {len(self.t)} frame times of a {width}x{height} sensor need "
-                f"({len(self.t)}, {height}, {width}) and {len(self.t)}"
+                f"({len(self.t)}, {height}, {width}) and {len(self.t)}; crop, turn or resize "
+                "them, or correct the sensor's size"
             )
 
     def _check_times(self, source: str) -> None:

@@ -114,3 +114,12 @@ def test_a_blob_filter_takes_and_gives_the_old_names_of_its_steps():
             filter = dataclasses.replace(blob.moment.filter, **{old: mine})
         with pytest.warns(DeprecationWarning, match=f"use Filter.{new}"):
             assert getattr(filter, new) is getattr(filter, old) is mine
+
+
+def test_a_motion_estimator_takes_and_gives_the_old_name_of_its_adaptation():
+    batch = jaxevent.egomotion.batch
+    mine = lambda *given: {}  # noqa: E731
+    with pytest.warns(DeprecationWarning, match=r"use HostEstimator\.adapt_lengths"):
+        method = dataclasses.replace(batch, lengths=mine)
+    with pytest.warns(DeprecationWarning, match=r"use HostEstimator\.adapt_lengths"):
+        assert method.adapt_lengths is method.lengths is mine

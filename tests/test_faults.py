@@ -250,6 +250,23 @@ def test_hot_pixels_are_those_that_fire_in_all_parts():
     assert found[hot].mean() > 0.99 and not found[~hot].any()
 
 
+@pytest.mark.parametrize("inverted", [False, True])
+def test_a_block_of_dead_pixels_is_told_by_the_frames(sound, inverted):
+    """Frames tell it from a region at rest; without frames the two are alike."""
+    events = sound.events[:]
+    block = (events.x >= 20) & (events.x < 40) & (events.y >= 10) & (events.y < 34)
+    columns = (events.t, events.x, events.y, events.p ^ inverted)
+    faulty = dataclasses.replace(sound, events=Events(*(one[~block] for one in columns)))
+    fault = jaxevent.check_consistency(faulty)[-1]
+    assert fault.name == "dead pixels"
+    assert fault.statistic == pytest.approx(20 * 24 / SIDE**2, rel=0.2)
+    assert names_of(dataclasses.replace(faulty, frames=None)) == []
+    still = sound.frames.images.copy()
+    still[:, 10:34, 20:40] = still[:1, 10:34, 20:40]
+    frames = dataclasses.replace(sound.frames, images=still)
+    assert "dead pixels" not in names_of(dataclasses.replace(faulty, frames=frames))
+
+
 @pytest.mark.parametrize("shape", ["disc", "rows", "dots"])
 def test_regions_at_rest_are_not_dead(shape):
     """Pixels count as dead between busy ones that see the same edges, not between hot ones."""

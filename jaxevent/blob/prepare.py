@@ -31,9 +31,7 @@ from jaxevent.recording import Recording, Times, check_times, microseconds
 STEPS_PER_CHUNK_CHOICES = (4, 8, 16, 32, 64, 128, 256)  # possible numbers
 STEPS_PER_SEGMENT = 8192
 EVENTS_PER_READ = 65536  # events read from a file at a time
-MAX_SIMULTANEOUS_EVENTS = (
-    16  # more events of one time are in the order of a readout, and not of the scene
-)
+MAX_UNSPREAD_TIES = 16  # more events of one time have the order of a readout, not of the scene
 CANDIDATE_SIGMAS = 3.5  # distance from a found path within which an event may be the target's
 MAX_CHUNK_US = 2**29  # between boundaries; two of them fit into int32
 NEVER_US = np.iinfo(np.int64).max
@@ -266,7 +264,7 @@ class ChunkPacker:
             owner = owner_candidates(part, self.joined, CANDIDATE_SIGMAS)
             accepted &= owner[:, 0] != NO_OWNER_INDEX
         order = np.arange(len(part))
-        _spread_ties(part.t, len(part) if self._as_stored else MAX_SIMULTANEOUS_EVENTS, order)
+        _spread_ties(part.t, len(part) if self._as_stored else MAX_UNSPREAD_TIES, order)
         order = order[begin - first : end - first]
         return _EventRows(part.t, part.x, part.y, part.p, accepted, owner, order, first)
 
@@ -322,6 +320,7 @@ class ChunkPacker:
 
         Only events at most `prefilter_time` older matter. So they are read again for every segment
         and no image of times is kept between segments.
+
         Args:
             events: Consecutive events.
             row: Row of the first one in the recording.

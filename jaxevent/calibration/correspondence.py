@@ -16,7 +16,7 @@ from jaxevent.codegen import njit_noalloc
 
 I0 = 0.1  # inside the logarithm: between the filters' 1 and the dark offset of sensors
 MAX_PAIRS = 16  # pairs of frames that are compared
-N_STEPS = 20  # lags on either side
+N_LAGS_PER_SIDE = 20  # lags on either side of 0
 STEPS_PER_INTERVAL = 8  # so that lags reach 2.5 intervals
 STEP_RANGE_US = (2_000, 20_000)
 MIN_PIXELS = 50  # clear in both frames
@@ -191,7 +191,7 @@ def measure_correspondence(sample: Sample) -> Correspondence | None:
         return None
     interval = int(np.median([s.frame_t[row + 1] - s.frame_t[row] for s, row in pairs]))
     step = int(np.clip(interval // STEPS_PER_INTERVAL, *STEP_RANGE_US))
-    lags = np.arange(-N_STEPS, N_STEPS + 1) * step
+    lags = np.arange(-N_LAGS_PER_SIDE, N_LAGS_PER_SIDE + 1) * step
     width, height = sample.size
     kinds = list(TRANSFORMS.values())[: len(TRANSFORMS) if width == height else 4]
     m, n = len(lags), len(kinds)
@@ -347,7 +347,7 @@ def _find_offset(sums: list[_Sums], step: int) -> float:
     Returns:
         The lag, us; NaN if no correlation is known.
     """
-    lags = np.arange(2 * N_STEPS + 1)
+    lags = np.arange(2 * N_LAGS_PER_SIDE + 1)
     curve, _ = _fit_windows(sums, lags, lags + 1)
     if not np.isfinite(curve).any():
         return np.nan
@@ -355,7 +355,7 @@ def _find_offset(sums: list[_Sums], step: int) -> float:
     left, middle, right = np.pad(curve, 1, constant_values=-np.inf)[top : top + 3]
     bend = left - 2 * middle + right
     inner = np.isfinite(bend) and bend < 0
-    return float((top - N_STEPS + (0.5 * (left - right) / bend if inner else 0)) * step)
+    return float((top - N_LAGS_PER_SIDE + (0.5 * (left - right) / bend if inner else 0)) * step)
 
 
 def _find_exposure(sums: list[_Sums], step: int, interval: int) -> tuple[float, float]:
@@ -369,8 +369,8 @@ def _find_exposure(sums: list[_Sums], step: int, interval: int) -> tuple[float, 
     Returns:
         Exposure, us, and dilution, see `Correspondence`.
     """
-    half, middle = np.mgrid[: N_STEPS - 1, : 2 * N_STEPS + 1].reshape(2, -1)
-    whole = (middle >= half) & (middle + half <= 2 * N_STEPS)
+    half, middle = np.mgrid[: N_LAGS_PER_SIDE - 1, : 2 * N_LAGS_PER_SIDE + 1].reshape(2, -1)
+    whole = (middle >= half) & (middle + half <= 2 * N_LAGS_PER_SIDE)
     half, middle = half[whole], middle[whole]
     r, change = _fit_windows(sums, middle - half, middle + half + 1)
     exposure = 2.0 * half * step

@@ -48,9 +48,15 @@ MAX_OFFSET_INTERVALS = 0.25  # stamp at one end of an exposure that lasts half t
 MAX_EXPOSURE_INTERVALS = 1.0  # frames of one camera are not exposed at the same time
 MAX_DILUTION = 1.25  # of the change per event; slow scenes without blur reach 1.1
 MAX_UNDONE_SHARE = 0.5  # of the events
+MAX_SILENT_SHARE, MIN_CHANGED_PIXELS = 0.02, 300  # of the pixels that change in the frames
+MIN_THRESHOLD_EVENTS = 4
 # Between frames that are equal, of pixels that change by several thresholds.
 MAX_REPEATED_SHARE, MIN_NET_EVENTS, MIN_CHANGING = 0.05, 2, 50
 MAX_FLICKER = 0.05  # of ln I, half the lowest thresholds of sensors
+DEAD_PIXELS_REMEDY = (
+    "look for pixels that are broken, or masked by the camera or a filter; images of their places "
+    "rest on the frames"
+)
 
 # Faults of the events alone, whether frames revealed them or not.
 EVENT_FAULTS = (
@@ -140,8 +146,7 @@ def _check_dead_pixels(sample: Sample) -> Iterator[Fault]:
     yield Fault(
         "dead pixels", sample.dead_share, MAX_DEAD_SHARE,
         f"{100 * sample.dead_share:.3g} % of the pixels between busy ones have no event at all",
-        "look for pixels that are broken, or masked by the camera or a filter; images of their "
-        "places rest on the frames",
+        DEAD_PIXELS_REMEDY,
     )  # fmt: skip
 
 
@@ -260,8 +265,11 @@ def _check_both(recording: Recording, sample: Sample) -> Iterator[Fault]:
         correspondence = measure_correspondence(sample) or correspondence
     has_polarity = not one_sign and (relation is None or turn is not None)
     is_related = has_polarity and correspondence.significance[0].max() > MIN_SIGNIFICANCE
-    yield from _check_brightness(sample, correspondence.offset if is_related else 0.0, has_polarity)
+    offset = correspondence.offset if is_related else 0.0
+    yield from _check_brightness(sample, offset, has_polarity)
     if is_related:
+        if sample.dead_share <= MAX_DEAD_SHARE:
+            yield from _check_silent_pixels(sample, offset)
         yield from _check_clock(correspondence)
 
 
@@ -344,6 +352,47 @@ def _check_clock(correspondence: Correspondence) -> Iterator[Fault]:
             f"{'later' if offset > 0 else 'earlier'} than their stamps",
             f"add {round(1e6 * offset)} us to the frames' times, or leave them: calibration finds "
             "the parameter clock_offset",
+        )  # fmt: skip
+
+
+def _check_silent_pixels(sample: Sample, offset: float) -> Iterator[Fault]:
+    """Check the share of pixels without an event, of those that change in the frames.
+
+    What is at rest changes in no frame. The log intensity of a pixel without an event stays between
+    c_off below and c_on above a level: its range is below twice the mean threshold. That is the sum
+    of changes between frames divided by that of their net events, of pixels with 4 events or more;
+    noise of the frames makes it larger.
+
+    Args:
+        sample: Sample of the recording.
+        offset: Time added to the frames' stamps, us; NaN: none.
+
+    Yields:
+        The fault.
+    """
+    offset_us, n = 0 if np.isnan(offset) else int(offset), len(sample.places)
+    counts, ranges, moved, net = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    for segment in sample.segments:
+        counts += np.bincount(segment.pixel, minlength=n)
+        covered = segment.is_covered(offset_us)
+        used = segment.clear & (np.append(covered, False) | np.append(False, covered))[:, None]
+        L = np.log(np.maximum(segment.intensity, 0) + np.float32(I0))
+        top, bottom = (np.where(used, v, -np.inf).max(0, initial=-np.inf) for v in (L, -L))
+        ranges = np.maximum(ranges, top + bottom)
+        changes, clear = log_changes(segment, I0)
+        on, off = count_between(segment, offset_us).swapaxes(0, 1)
+        clear &= covered[:, None]
+        moved += (clear * np.abs(changes)).sum(0)
+        net += (clear * np.abs(on - off)).sum(0)
+    busy = counts >= MIN_THRESHOLD_EVENTS
+    threshold = moved[busy].sum() / max(net[busy].sum(), 1)
+    changed = (ranges > 2 * threshold) & ~sample.hot.ravel()[sample.places]
+    number, share = int(changed.sum()), float((counts == 0)[changed].sum() / max(changed.sum(), 1))
+    if busy.sum() >= MIN_CHANGED_PIXELS and number >= MIN_CHANGED_PIXELS:
+        yield Fault(
+            "dead pixels", share, MAX_SILENT_SHARE,
+            f"{100 * share:.3g} % of the {number:,} pixels that change in the frames have no event",
+            DEAD_PIXELS_REMEDY,
         )  # fmt: skip
 
 

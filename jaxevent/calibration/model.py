@@ -43,7 +43,7 @@ MAX_RELATIVE_NOISE = 0.15  # of a frame's I + I0, beyond which logarithms of noi
 MIN_CHANGES = 60
 MAX_CHANGES = 60_000
 GAUSSIAN_SCALE = 1.15  # standard deviation of Gaussian errors, per scale of Student's t
-N_STEPS = 12
+MAX_FIT_STEPS = 12  # Gauss-Newton steps
 TRUST = np.array([np.inf, np.inf, 2e-3, 5e-4, np.inf])  # largest steps of the last three
 PRECISION = np.array([1e-5, 1e-5, 1e-6, 1e-6, 1e-6])
 
@@ -260,7 +260,7 @@ class Model:
             joined = Changes(*[values[..., keep] for values in columns])
         return joined
 
-    def fit(self, start: Physics, free: tuple[bool, ...], steps: int = N_STEPS) -> Fit | None:
+    def fit(self, start: Physics, free: tuple[bool, ...], steps: int = MAX_FIT_STEPS) -> Fit | None:
         """Maximise the likelihood by Gauss-Newton steps.
 
         Args:

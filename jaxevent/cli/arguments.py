@@ -336,7 +336,13 @@ def guard_outputs(options: dict[str, Any], words: Sequence[str]) -> Iterator[dic
     elif outputs:
         from jaxevent.io.calibration import split_name
         from jaxevent.io.checks import companions
-        from jaxevent.io.output import Command, allow_writing_into_folders, check_outputs, running
+        from jaxevent.io.output import (
+            Command,
+            allow_writing_into_folders,
+            check_outputs,
+            claim_outputs,
+            running,
+        )
 
         named = [path for name in outputs if (path := taken[name]) is not None]
         inputs = [
@@ -349,10 +355,11 @@ def guard_outputs(options: dict[str, Any], words: Sequence[str]) -> Iterator[dic
         camera = taken.get("reading", {}).get("camera")
         if isinstance(camera, str):
             inputs.append(split_name(camera)[0])
-        check_outputs(named, inputs, force=force)
         read = [file for path in inputs for file in (path, *companions(path))]
-        with allow_writing_into_folders(force), running(Command(words, read)):
-            yield taken
+        with claim_outputs(named) as claims:
+            check_outputs(named, inputs, force=force, claims=claims)
+            with allow_writing_into_folders(force), running(Command(words, read)):
+                yield taken
     else:
         yield taken
 

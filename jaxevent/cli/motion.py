@@ -174,13 +174,15 @@ def run(**given: Any) -> None:
 
 def _estimate_and_write(options: Options, kind: "type[Model] | None") -> None:
     """Estimate the motion of a recording and write it; if `kind` is None, select the model."""
-    from jaxevent.egomotion.truth import imu_rotation as rotation_of
+    from jaxevent.egomotion.truth import parse_imu_rotation
     from jaxevent.runs.egomotion import find_estimator
     from jaxevent.show.motion import Output
 
     _check_options(options, kind)
     assert options.out is not None
-    gyro_rotation = None if options.imu_rotation is None else rotation_of(options.imu_rotation)
+    gyro_rotation = (
+        None if options.imu_rotation is None else parse_imu_rotation(options.imu_rotation)
+    )
     output = Output(options.out, options.rate, options.truth, flow=options.flow)
     whole = _open(options)
     arguments.warn_of_faults(whole, frames=False)
@@ -519,12 +521,12 @@ def _gyro_without_bias(
     """
     import numpy as np
 
-    from jaxevent.egomotion import from_gyro
+    from jaxevent.egomotion import twists_from_gyro
     from jaxevent.egomotion.truth import fit_gyro_bias
 
     assert recording.imu is not None  # see `_open`
     zero = np.zeros(3) if bias is None else bias
-    measured = from_gyro(recording.imu, zero, gyro_rotation)
+    measured = twists_from_gyro(recording.imu, zero, gyro_rotation)
     if bias is not None:
         return measured
     motion = estimator.estimate(recording, values, **settings)

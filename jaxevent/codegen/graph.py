@@ -288,8 +288,6 @@ def constant_value(node: Any) -> Any:
 def find_dependencies(results: list[Node], stop: set[Node] | None = None) -> list[Node]:
     """Return the nodes that results depend on, in order of creation.
 
-    `stop` ones are followed no further.
-
     Args:
         results: The results, which are among the nodes.
         stop: Nodes whose arguments are not followed; None: there are none.

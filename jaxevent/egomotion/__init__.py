@@ -43,10 +43,10 @@ if TYPE_CHECKING:
     from jaxevent.egomotion.truth import (
         KnownMotion,
         Twists,
-        from_gyro,
-        from_poses,
         gyro_bias,
         known_motion,
+        twists_from_gyro,
+        twists_from_poses,
     )
 
 # Loaded when first used: compiled preparation and SciPy are slow to import.
@@ -60,7 +60,14 @@ _HOMES = {
     "motion": ("MotionEstimate",),
     "particle_filter.estimator": ("voting",),
     "scores": ("motion_errors",),
-    "truth": ("KnownMotion", "Twists", "from_gyro", "from_poses", "gyro_bias", "known_motion"),
+    "truth": (
+        "KnownMotion",
+        "Twists",
+        "twists_from_gyro",
+        "twists_from_poses",
+        "gyro_bias",
+        "known_motion",
+    ),
 }
 _MODULES = ("candidates", "flow", "geometry", "models", "motion", "scores", "truth")
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
@@ -78,8 +85,8 @@ __all__ = [
     "find_model",
     "flow",
     "frames",
-    "from_gyro",
-    "from_poses",
+    "twists_from_gyro",
+    "twists_from_poses",
     "geometry",
     "gyro_bias",
     "known_motion",

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from jaxevent.calibration.faults import warn_of_unit
 from jaxevent.camera import PinholeCamera
-from jaxevent.deprecated import renamed_methods
+from jaxevent.deprecated import renamed_fields, renamed_methods
 from jaxevent.egomotion.models import MODELS, Model, find_model, in_words
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.patches import (
@@ -151,6 +151,7 @@ class TrainingRuns(eqx.Module):
     suit="adapt_params",
     follow="training_runs",
 )
+@renamed_fields(lengths="adapt_lengths")
 @dataclasses.dataclass(frozen=True, repr=False)
 class MotionEstimator(Estimator[P]):
     """A method that estimates the camera's motion.
@@ -158,17 +159,17 @@ class MotionEstimator(Estimator[P]):
     `estimate` returns a `MotionEstimate`. All methods have the options `model`, a name of
     `models.MODELS`, "package.module:Class" or the class; `camera`, by default the recording's; and
     `seed`, of the random numbers. Some have `smooth`, whether to use later events too; `cloud`, the
-    number of particles of an estimate to return; and `gyro`, measured twists (`truth.from_gyro`).
+    number of particles of an estimate to return; and `gyro`, twists of `truth.twists_from_gyro`.
 
     Attributes:
         linear: Whether it needs a flow that is linear in the motion.
-        lengths: Function (params, speed) that returns values of parameters adapted to the speed of
-            the image, as lengths of windows.
+        adapt_lengths: Function (params, speed) that returns values of parameters adapted to the
+            speed of the image, as lengths of windows.
     """
 
     family: ClassVar[str] = "egomotion"
     linear: bool = dataclasses.field(default=False, kw_only=True)
-    lengths: Callable[[Any, ImageSpeed], dict[str, float]] | None = dataclasses.field(
+    adapt_lengths: Callable[[Any, ImageSpeed], dict[str, float]] | None = dataclasses.field(
         default=None, kw_only=True
     )
     options: frozenset[str] = dataclasses.field(default=COMMON_OPTIONS, kw_only=True)
@@ -280,14 +281,14 @@ class MotionEstimator(Estimator[P]):
         Returns:
             The parameters, with messages about them.
         """
-        if self.lengths is None:
+        if self.adapt_lengths is None:
             return AdaptedParams(params, speed, "", "")
         speed = speed or measure_image_speed(recording, camera)
         if speed is None:
             warn_of_unit(recording)  # a clock that is too fast or too slow may be the cause
             still = f"nothing was seen to move {describe_windows(recording)}"
             return AdaptedParams(params, None, f"{still}; windows are as by default", "")
-        chosen = self.lengths(params, speed)
+        chosen = self.adapt_lengths(params, speed)
         chosen = {name: value for name, value in chosen.items() if name not in given}
         settings = self.Params.settings()
         values = ", ".join(f"{name} = {v:.2g} {settings[name].unit}" for name, v in chosen.items())
@@ -396,6 +397,7 @@ class HostInputs(NamedTuple):
     options: Mapping[str, Any]
 
 
+@renamed_fields(lengths="adapt_lengths")
 @dataclasses.dataclass(frozen=True, repr=False)
 class HostEstimator(MotionEstimator[P]):
     """A method on the host: `solve(params, inputs)` estimates the motion of a whole recording."""

@@ -236,7 +236,7 @@ def find_gyro_axes(motion: MotionEstimate, truth: KnownMotion) -> str | None:
     Returns:
         The axes, see `find_imu_axes`; None if the camera's fit, or were given.
     """
-    if not truth.guesses_axes:
+    if not truth.assumes_camera_axes:
         return None
     estimated = motion(truth.t, centred=True, extrapolate=True)
     rows = estimated.valid & np.isfinite(estimated.mean).all(1)

@@ -3,7 +3,7 @@
     truth = known_motion(recording, "rotation")
     Omega = truth(times)
 
-    twists = from_poses(recording.poses, span=0.02)
+    twists = twists_from_poses(recording.poses, span=0.02)
     T, Omega = twists(times)
 
 Twists are the camera's, as in `jaxevent.egomotion.geometry`: T in m/s and Omega in rad/s, in its
@@ -19,7 +19,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from jaxevent.deprecated import renamed_methods, renamed_names
+from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
 from jaxevent.egomotion.models import Model, find_model, in_words, unit_vectors
 from jaxevent.errors import InputError, InputWarning
 from jaxevent.io.tables import read_table
@@ -105,7 +105,7 @@ class Twists:
         return T, _interpolate_columns(at, self.t, self.Omega)
 
 
-def from_poses(poses: Poses, span: float | int = 0.0) -> Twists:
+def twists_from_poses(poses: Poses, span: float | int = 0.0) -> Twists:
     """Measure twists log(P1^-1 P2) / (t2 - t1) from camera-to-world poses.
 
     The twist holds at the middle of t1 and t2. Noise of the poses falls with the span, and so does
@@ -153,7 +153,7 @@ def _is_rotation(R: NDArray[np.float64]) -> bool:
     return is_orthogonal and float(np.linalg.det(R)) > 0
 
 
-def from_gyro(
+def twists_from_gyro(
     imu: Imu,
     bias: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
     rotation: ArrayLike | str | None = None,
@@ -175,7 +175,7 @@ def from_gyro(
     """
     bias = np.asarray(bias, np.float64)
     if isinstance(rotation, str):
-        rotation = imu_rotation(rotation)
+        rotation = parse_imu_rotation(rotation)
     R = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
     if bias.shape != (3,) or not np.isfinite(bias).all():
         raise InputError(
@@ -228,7 +228,7 @@ def gyro_bias(imu: Imu, start: Times, stop: Times) -> NDArray[np.float64]:
     return imu.gyro[rows].mean(0)
 
 
-def imu_rotation(text: str) -> NDArray[np.float64]:
+def parse_imu_rotation(text: str) -> NDArray[np.float64]:
     """Parse the rotation (3, 3) from the axes of an IMU to the camera's.
 
     Args:
@@ -280,7 +280,7 @@ def find_imu_axes(estimate: NDArray[np.floating], measured: NDArray[np.floating]
         measured: (n, 3) measured angular velocity, rad/s.
 
     Returns:
-        The axes, as `imu_rotation` parses them, or None if the camera's own fit about as well.
+        The axes as text for `parse_imu_rotation`; None if the camera's own fit about as well.
     """
 
     def misalignment(R: NDArray[np.floating]) -> float:
@@ -299,6 +299,7 @@ def find_imu_axes(estimate: NDArray[np.floating], measured: NDArray[np.floating]
 
 
 @renamed_methods(within="covers")
+@renamed_fields(guesses_axes="assumes_camera_axes")
 @dataclasses.dataclass(frozen=True, repr=False)
 class KnownMotion:
     """A motion that is known at some times, a function of time: `values = truth(times)`.
@@ -307,13 +308,13 @@ class KnownMotion:
         model: The motion model, of d components.
         t: (n,) times, us.
         values: (n, d) motions.
-        guesses_axes: Whether they are a gyro's rates, whose axes are taken for the camera's.
+        assumes_camera_axes: Whether they are a gyro's rates, whose axes are taken for the camera's.
     """
 
     model: type[Model]
     t: NDArray[np.int64]
     values: NDArray[np.float64]
-    guesses_axes: bool = False
+    assumes_camera_axes: bool = False
 
     def __call__(self, times: Times) -> NDArray[np.float64]:
         """Interpolate the motion (times, d) linearly, at integers (us) or floats (s).
@@ -370,7 +371,7 @@ def known_motion(
     check_recording(recording, "known_motion")
     model = find_model(model)
     if isinstance(rotation, str):
-        rotation = imu_rotation(rotation)
+        rotation = parse_imu_rotation(rotation)
     if isinstance(source, pd.DataFrame):
         return motion_from_table(source, model, f"{recording.name}: the true motion")
     if source not in ("auto", "poses", "gyro"):
@@ -391,9 +392,9 @@ def known_motion(
     by_gyro = imu is not None and len(imu) > 0 and "gyro" in model.truth_sources
     by_poses = poses is not None and len(poses) > 0 and "poses" in model.truth_sources
     if source != "gyro" and by_poses and poses is not None:
-        twists = from_poses(poses, span)
+        twists = twists_from_poses(poses, span)
     elif source != "poses" and by_gyro and imu is not None:
-        twists, guesses = from_gyro(imu, bias, rotation), rotation is None
+        twists, guesses = twists_from_gyro(imu, bias, rotation), rotation is None
     else:
         missing = {"auto": "neither poses nor an IMU", "poses": "no poses", "gyro": "no IMU"}
         what = missing[str(source)]
@@ -427,7 +428,7 @@ def _planar_at_depth(
             f"{recording.describe_left_out('poses' if missing == 'poses' else 'camera')}; "
             "leave it out and give a table of the true motion"
         )
-    twists, f2 = from_poses(recording.poses, span), recording.camera.fx * recording.camera.fy
+    twists, f2 = twists_from_poses(recording.poses, span), recording.camera.fx * recording.camera.fy
     return KnownMotion(
         model, twists.t, model.from_twists_at_depth(twists, float(np.sqrt(f2)), depth)
     )

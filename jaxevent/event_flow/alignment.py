@@ -46,7 +46,7 @@ from scipy.ndimage import gaussian_filter
 from jaxevent.codegen import njit_noalloc, njit_noalloc_inlined
 from jaxevent.recording import Events
 
-N_STEPS = 5  # Gauss-Newton steps at each size of cells
+N_STEPS_PER_CELL_SIZE = 5  # Gauss-Newton steps
 CLOCK_PARTS = 4  # pieces of half a window in which the clock of events goes evenly
 CLOCK_INFORMATION = 100.0  # of a clock's time before alignment; not sensitive
 CLOCK_STEP, CLOCK_REACH = 0.5, 0.2  # part of a step that is made, and the longest one
@@ -691,7 +691,7 @@ class Alignment:
             image = np.zeros((3, *_image_shape(self.shape, cell)), np.float32)
             scratch = np.empty_like(image[0])
             reach, before = np.full((*self.nodes, 1), float(cell)), np.zeros_like(u)
-            for _ in range(N_STEPS):
+            for _ in range(N_STEPS_PER_CELL_SIZE):
                 s = np.interp(place, np.arange(len(ahead)), ahead).astype(np.float32)
                 _warp_and_vote(x, y, s, p, u, self.spacing, cell, warped, image)
                 for channel, passes in zip(image, N_BLURS, strict=True):

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.codegen import njit
+from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
 from jaxevent.events.blocks import Part, Size, parse_duration, select_events, size_of, source_of
 from jaxevent.events.images import count_events
@@ -65,11 +66,11 @@ def is_hot(
     Returns:
         (H, W), True for hot pixels.
     """
-    return (counts >= least) & (counts > ratio * busiest_neighbour(counts))
+    return (counts >= least) & (counts > ratio * max_neighbour_count(counts))
 
 
-def busiest_neighbour(counts: NDArray[np.integer]) -> NDArray[np.integer]:
-    """Return the largest count of the 8 pixels around each, (H, W), of counts (H, W)."""
+def max_neighbour_count(counts: NDArray[np.integer]) -> NDArray[np.integer]:
+    """Return the largest count among the 8 neighbours of each pixel, (H, W), of counts (H, W)."""
     height, width = counts.shape
     around = np.pad(counts, 1)
     busiest = np.zeros_like(counts)
@@ -181,8 +182,8 @@ def find_supported(
 def filter_refractory(part: Part, period: int | float, *, size: Size | None = None) -> Part:
     """Remove events within a dead time after the last one kept at the same pixel.
 
-    A pixel with that dead time would have fired so. (tonic's `RefractoryPeriod` measures from the
-    event before, kept or not, so that a fast pixel falls silent.)
+    What remains is what a pixel with that dead time would have fired. (tonic's `RefractoryPeriod`
+    measures from the event before, kept or not, so that a fast pixel falls silent.)
 
     Args:
         part: Events, or a recording.
@@ -221,3 +222,6 @@ def _outside_dead_time(t, x, y, last, dead_us):
         if kept[i]:
             last[y[i], x[i]] = t[i]
     return kept
+
+
+__getattr__ = renamed_names(__name__)

@@ -65,6 +65,7 @@ def check_outputs(
     *,
     force: bool = False,
     inside: Sequence[Path] = (),
+    claims: Sequence[Path] = (),
 ) -> None:
     """Raise `InputError` for outputs that would cost an input, each other, or an existing file.
 
@@ -75,10 +76,12 @@ def check_outputs(
         inputs: Files or folders that are read, with those that are read beside them.
         force: Whether existing files, and files in existing folders, are to be replaced.
         inside: Outputs to be written although they exist, as those of a run that goes on.
+        claims: Siblings of outputs by which this process claims them, see `claim_outputs`.
 
     Raises:
         InputError: An output would cost something.
     """
+    names = {claim.name for claim in claims}
     for number, out in enumerate(outputs):
         for other in outputs[:number]:
             if _is_same_file(out, other):
@@ -94,7 +97,8 @@ def check_outputs(
             raise InputError(
                 f"{out}: the folder is not empty; choose another, or replace its files with --force"
             )
-        if any(_lock_state(partial) == "held" for partial in partials(out)):
+        others = (one for one in partials(out) if one.name not in names)
+        if any(_lock_state(partial) == "held" for partial in others):
             raise InputError(
                 f"{out}: is being written by another process; wait for it, or choose another name"
             )
@@ -185,6 +189,30 @@ def locked(path: Path) -> Iterator[bool]:
         yield holds
     finally:
         os.close(descriptor)
+
+
+@contextlib.contextmanager
+def claim_outputs(outputs: Sequence[Path]) -> Iterator[list[Path]]:
+    """Claim outputs for a command that writes them later; `check_outputs` refuses them to others.
+
+    An output that cannot be claimed, as in a folder that does not exist, is left out.
+
+    Args:
+        outputs: Files or folders to be written.
+
+    Yields:
+        Locked siblings of the outputs, which are removed after the block.
+    """
+    claims: list[Path] = []
+    with contextlib.ExitStack() as stack:
+        for out in (path.absolute() for path in outputs if path.absolute().name):
+            claim = partial_path(out)
+            stack.callback(_remove, claim)
+            with contextlib.suppress(OSError):
+                claim.touch(exist_ok=False)
+                stack.enter_context(locked(claim))
+                claims.append(claim)
+        yield claims
 
 
 @dataclasses.dataclass(frozen=True)

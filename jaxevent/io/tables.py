@@ -12,7 +12,7 @@ NumPy arrays (.npy) are structured or of shape (events, 4) or (4, events). Archi
 
     t, x, y, p            events: times, columns, rows, polarity (bool, 0/1 or -1/1)
     width, height         pixels
-    frames                (frames, height, width) uint8, uint16 or floats in [0, 1]
+    frames                (frames, height, width[, 3]) uint8, uint16 or floats in [0, 1]
     frame_t               mid-exposure times
     exp_start, exp_end    start and end of the exposures; where present, frame_t is not used
     imu_t, gyro, acc      (samples,), (samples, 3) rad/s, (samples, 3) m/s^2
@@ -44,6 +44,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.arrays import as_images
 from jaxevent.errors import InputError, require
 from jaxevent.io.checks import (
     ReadOptions,
@@ -162,9 +163,12 @@ def read_npz(path: Path, options: ReadOptions) -> Recording:
     columns = {} if rows is not None else dict(zip("txyp", take("t", "x", "y", "p"), strict=True))
     images = take("frames")[0] if "frames" in arrays else None
     if images is not None and images.ndim != 3:
-        raise InputError(
-            f"{path}: frames has shape {images.shape}; it must be (frames, height, width)"
-        )
+        try:
+            images, colours = as_images(images)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+        if colours is not None:
+            arrays.setdefault("rgb", colours)
     sides = [arrays.pop(name) for name in ("width", "height") if name in arrays]
     stored = whole_size(*sides, source) if options.size is None and len(sides) == 2 else None
     otherwise = f"{path}: has no width and height and no frames; add them or else"

@@ -26,7 +26,7 @@ MIN_CHOICE_GAIN = 0.1  # the same of each choice, of a few frames
 FRAMES_TO_CHOOSE = 5  # of a segment, where methods are slow
 MAX_PIXELS = 40_000
 MAX_EVENTS = 400_000  # of all segments
-N_STEPS = 6
+N_GAUSS_NEWTON_STEPS = 6
 N_TRIES = 4  # of a step, each with more damping
 CLOCK_STEP_FRAMES = 0.02  # of differences, in the time between frames
 LOG_STEP = 0.1  # of differences of positive numbers
@@ -187,7 +187,7 @@ def refine(
         known = [(_all_errors(parts, method, at), at) for at in (params, *more)]
         e, at = min(known, key=lambda one: float((one[0] ** 2).mean()))
         best, damping = float((e**2).mean()), 0.01
-        for _ in range(N_STEPS):
+        for _ in range(N_GAUSS_NEWTON_STEPS):
             # Errors have kinks, so that a derivative on one side is biased by the step.
             sides = [
                 [_all_errors(parts, method, move(at, sign * LOG_STEP * unit)) for sign in (-1, 1)]

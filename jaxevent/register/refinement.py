@@ -78,25 +78,26 @@ def refine(
     tries = []
     for H in starts:
         problem = _AlignmentProblem(recording, other, grid, H, keep_offset)
-        at = np.append(problem.corners, float(offset))
+        unknowns = np.append(problem.corners, float(offset))
         with contextlib.suppress(InputError):
             problem.choose_pairs(float(offset))
-            tries.append((problem.fit_thresholds(at, _SMOOTHINGS_PX[0]).agreement, H, problem, at))
+            fit = problem.fit_thresholds(unknowns, _SMOOTHINGS_PX[0])
+            tries.append((fit.agreement, H, problem, unknowns))
     if not tries:
         raise InputError(
             f"{other.name}: with the offset {offset:g} s its frames show too little, unclipped, of "
             "what the events show to compare them; give another offset, homography or calibration"
         )
-    agreement, H, problem, at = max(tries, key=lambda one: one[0])
+    agreement, H, problem, unknowns = max(tries, key=lambda one: one[0])
     for sigma in _SMOOTHINGS_PX:
-        at, agreement = problem.run_gauss_newton(at, sigma)
+        unknowns, agreement = problem.run_gauss_newton(unknowns, sigma)
         if agreement < MIN_AGREEMENT / 2:  # correct registrations begin above 0.5
             break
     if H is not None:
-        H = problem.homography(at)
+        H = problem.homography(unknowns)
         grid = recording_grid(recording, other, H)
     assert grid is not None
-    return Registration(grid, float(at[-1]), H, float(agreement))
+    return Registration(grid, float(unknowns[-1]), H, float(agreement))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,21 +152,21 @@ class _AlignmentProblem:
         self._near: tuple[float, list] | None = None
         self._images: tuple[Any, Any] = None, None
 
-    def homography(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
+    def homography(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the homography that maps the corners to at[:8] (Hartley & Zisserman, 4.1)."""
         rows, values = [], []
-        for (x, y), (u, v) in zip(self.outline, at[:8].reshape(4, 2), strict=True):
+        for (x, y), (u, v) in zip(self.outline, unknowns[:8].reshape(4, 2), strict=True):
             rows += [[x, y, 1, 0, 0, 0, -u * x, -u * y], [0, 0, 0, x, y, 1, -v * x, -v * y]]
             values += [u, v]
         return np.append(np.linalg.solve(np.array(rows), values), 1.0).reshape(3, 3)
 
-    def positions(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
+    def positions(self, unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the positions (n, 2), px, in the other camera of compared pixels; NaN outside."""
         s = self.stride
         if self.fixed is not None:
             return self.fixed[s // 2 :: s, s // 2 :: s].reshape(-1, 2)
         pixels = self.pixels[s // 2 :: s, s // 2 :: s].reshape(-1, 2)
-        seen = distort(self.other.camera, apply_homography(self.homography(at), pixels))
+        seen = distort(self.other.camera, apply_homography(self.homography(unknowns), pixels))
         return mask_outside(seen, (self.other.width, self.other.height))
 
     def choose_pairs(self, offset: float) -> None:
@@ -247,17 +248,17 @@ class _AlignmentProblem:
             self._near = offset, found
         return self._near[1]
 
-    def frame_changes(self, at: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+    def frame_changes(self, unknowns: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
         """Return the smoothed changes of frames at the compared pixels.
 
         Args:
-            at: Corners' positions (8,), if a homography is fitted, and the offset.
+            unknowns: Corners' positions (8,), if a homography is fitted, and the offset.
             sigma: Smoothing, px of the event camera.
 
         Returns:
             (pairs, n, 4): D, its gradient along x and y, and its weight.
         """
-        where = self.positions(at)
+        where = self.positions(unknowns)
         part = self.pixels[self.stride // 2 :: self.stride, self.stride // 2 :: self.stride]
         scale = pixel_scale(where.reshape(part.shape)) / self.stride
         images = self._smoothed_changes(sigma, scale)
@@ -292,40 +293,40 @@ class _AlignmentProblem:
         return self._images[1]
 
     def run_gauss_newton(
-        self, at: NDArray[np.float64], sigma: float
+        self, unknowns: NDArray[np.float64], sigma: float
     ) -> tuple[NDArray[np.float64], float]:
         """Take Gauss-Newton steps at one smoothing until they are small.
 
         Args:
-            at: Corners' positions (8,), if a homography is fitted, and the offset.
+            unknowns: Corners' positions (8,), if a homography is fitted, and the offset.
             sigma: Smoothing, px of the event camera.
 
         Returns:
             The unknowns, and the correlation of changes.
         """
-        self.choose_pairs(float(at[-1]))
+        self.choose_pairs(float(unknowns[-1]))
         self.stride = max(self.finest, int(sigma / 1.3))  # neighbours in smooth images are alike
-        fit = self.fit_thresholds(at, sigma)
+        fit = self.fit_thresholds(unknowns, sigma)
         for _ in range(_MAX_STEPS):
-            step, moved = self.gauss_newton_step(at, sigma, fit), None
+            step, moved = self.gauss_newton_step(unknowns, sigma, fit), None
             for _ in range(4):
-                now = self.fit_thresholds(at + step, sigma)
+                now = self.fit_thresholds(unknowns + step, sigma)
                 if now.agreement > fit.agreement:
-                    moved = at + step
+                    moved = unknowns + step
                     break
                 step = step / 3
             if moved is None:
                 break
-            at, fit = moved, now
+            unknowns, fit = moved, now
             if np.abs(step[:-1]).max(initial=0) < 5e-3 and abs(step[-1]) < 3e-6:
                 break
-        return at, fit.agreement
+        return unknowns, fit.agreement
 
-    def fit_thresholds(self, at: NDArray[np.float64], sigma: float) -> _Fit:
+    def fit_thresholds(self, unknowns: NDArray[np.float64], sigma: float) -> _Fit:
         """Fit the thresholds with all other unknowns fixed, and correlate the changes.
 
         Args:
-            at: Corners' positions (8,), if a homography is fitted, and the offset.
+            unknowns: Corners' positions (8,), if a homography is fitted, and the offset.
             sigma: Smoothing, px of the event camera.
 
         Returns:
@@ -334,14 +335,14 @@ class _AlignmentProblem:
         Raises:
             InputError: Frames and events show too little in common.
         """
-        D, slope_x, slope_y, counts = np.moveaxis(self.frame_changes(at, sigma), -1, 0)
+        D, slope_x, slope_y, counts = np.moveaxis(self.frame_changes(unknowns, sigma), -1, 0)
         use = counts > 0.99
         if use.sum() < 100:
             raise InputError(
                 f"{self.other.name}: shows too little of what the events show, unclipped, to "
                 "compare them; correct the calibration or homography, or give other frames"
             )
-        X = self.event_changes(float(at[-1]), sigma)[use]
+        X = self.event_changes(float(unknowns[-1]), sigma)[use]
         X, D = np.concatenate([X, np.ones((len(X), 1))], -1), D[use]
         weight, b = np.ones(len(D)), np.zeros(3)
         for _ in range(3):
@@ -353,21 +354,21 @@ class _AlignmentProblem:
         return _Fit(X, D, np.stack([slope_x[use], slope_y[use]], -1), use, weight, b, agreement)
 
     def gauss_newton_step(
-        self, at: NDArray[np.float64], sigma: float, fit: _Fit
+        self, unknowns: NDArray[np.float64], sigma: float, fit: _Fit
     ) -> NDArray[np.float64]:
         """Return the Gauss-Newton step at given unknowns, limited to a multiple of the smoothing.
 
         D + D' dh = X(o) b + (X' b) do + X db is linear in dh, do and b + db.
 
         Args:
-            at: Corners' positions (8,), if a homography is fitted, and the offset.
+            unknowns: Corners' positions (8,), if a homography is fitted, and the offset.
             sigma: Smoothing, px of the event camera.
             fit: Fit at these unknowns.
 
         Returns:
-            The step, in the order of `at`.
+            The step, in the order of `unknowns`.
         """
-        offset, free = float(at[-1]), len(at) - 1
+        offset, free = float(unknowns[-1]), len(unknowns) - 1
         columns = [fit.X]
         if not self.keep_offset:
             delta = min(self.apart / 8, 2000.0) * 1e-6
@@ -377,13 +378,13 @@ class _AlignmentProblem:
             columns.append(((later - earlier) @ fit.b[:2] / (2 * delta))[:, None])
         pixel, eps = np.nonzero(fit.use)[1], 0.01
         for k in range(free):
-            ahead, back = at.copy(), at.copy()
+            ahead, back = unknowns.copy(), unknowns.copy()
             ahead[k] += eps
             back[k] -= eps
             move = np.nan_to_num((self.positions(ahead) - self.positions(back)) / (2 * eps))
             columns.append(-(fit.slope * move[pixel]).sum(-1, keepdims=True))
         found = _least_squares(np.concatenate(columns, 1), fit.D, fit.weight)[3:]
-        step = np.zeros(len(at))
+        step = np.zeros(len(unknowns))
         if not self.keep_offset:
             step[-1], found = found[0], found[1:]
         step[:free] = found

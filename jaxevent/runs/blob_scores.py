@@ -95,13 +95,13 @@ class KnownPositions:
     Attributes:
         t: (T,) times, us.
         xi: (T, targets, 2) positions, px, NaN where unknown.
-        more: Columns of `OPTIONAL_COLUMNS` that are given, (T, targets) each.
+        quantities: Columns of `OPTIONAL_COLUMNS` that are given, (T, targets) each.
         id: (targets,) ids of the targets.
     """
 
     t: NDArray[np.int64]
     xi: NDArray[np.float64]
-    more: Mapping[str, NDArray[np.float64]] = dataclasses.field(default_factory=dict)
+    quantities: Mapping[str, NDArray[np.float64]] = dataclasses.field(default_factory=dict)
     id: NDArray[Any] = dataclasses.field(default_factory=lambda: np.zeros(1, np.int64))
 
 
@@ -203,8 +203,8 @@ class Targets:
                 f"{path}: no position is within {format_span((first, last + 1))}, the "
                 f"events' time in {recording.name}; times are seconds on its clock"
             )
-        more = {name: value[inside] for name, value in known.more.items()}
-        return KnownPositions(known.t[inside], known.xi[inside], more, known.id)
+        quantities = {name: value[inside] for name, value in known.quantities.items()}
+        return KnownPositions(known.t[inside], known.xi[inside], quantities, known.id)
 
     def first_seeds(self, known: KnownPositions | None, params: TrackerParams) -> list[Any] | None:
         """Return one seed per target, at its first known position; None if nothing is known."""
@@ -495,7 +495,7 @@ def _quantity_errors(
         Root mean square errors by name: velocity in px/s, size in ln px, theta in degrees, range
         relative, inverse_ttc in 1/s.
     """
-    more, out = known.more, {}
+    more, out = known.quantities, {}
     if {"vx", "vy"} <= more.keys():
         out["velocity"] = _rms(np.hypot(mean[..., 2] - more["vx"], mean[..., 3] - more["vy"]))
     if {"lambda1", "lambda2"} <= more.keys():
@@ -544,7 +544,7 @@ def _inverse_ttc_errors(
     Raises:
         InputError: A pair is not two of the targets.
     """
-    truth, errors, ids = known.more["inverse_ttc"], [], known.id.tolist()
+    truth, errors, ids = known.quantities["inverse_ttc"], [], known.id.tolist()
     x, P = jnp.asarray(mean), jnp.asarray(covariance)
     paired: set[int] = set()
     for pair in options.get("pairs", []):

@@ -67,7 +67,7 @@ from jaxevent.egomotion.estimator import (
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.egomotion.motion import MotionEstimate
 from jaxevent.egomotion.scores import errors_by_part, score_motion, warn_of_gyro_axes
-from jaxevent.egomotion.truth import KnownMotion, from_gyro, imu_rotation, known_motion
+from jaxevent.egomotion.truth import KnownMotion, known_motion, parse_imu_rotation, twists_from_gyro
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.io.output import finite, values_of
@@ -189,7 +189,7 @@ def true_motion(recording: Recording, options: Settings) -> KnownMotion:
 
 def _rotation(options: Settings) -> NDArray[np.float64] | None:
     axes = options.get("imu_rotation")
-    return None if axes is None else imu_rotation(axes)
+    return None if axes is None else parse_imu_rotation(axes)
 
 
 def _bias(options: Settings) -> NDArray[np.float64]:
@@ -299,7 +299,7 @@ def _settings(
     if options.get("gyro", False) and "gyro" in method.options:
         if recording.imu is None:
             raise InputError(f"{recording.name}: holds no IMU; leave out gyro = true")
-        settings["gyro"] = from_gyro(recording.imu, bias, _rotation(options))
+        settings["gyro"] = twists_from_gyro(recording.imu, bias, _rotation(options))
     return settings
 
 

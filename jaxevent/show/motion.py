@@ -21,8 +21,8 @@ from jaxevent.egomotion.scores import MotionScores, find_gyro_axes, score_motion
 from jaxevent.egomotion.truth import (
     KnownMotion,
     fit_gyro_bias,
-    from_poses,
     known_motion,
+    twists_from_poses,
 )
 from jaxevent.errors import InputError, MissingExtra, require
 from jaxevent.estimator import Estimate
@@ -204,7 +204,7 @@ def motion_at_fitted_depth(
             f"{recording.describe_left_out('poses') or recording.describe_left_out('camera')}; "
             f"give --truth a table with the columns {', '.join(('t', *model.components))}"
         )
-    twists = from_poses(recording.poses, span)
+    twists = twists_from_poses(recording.poses, span)
     f = math.sqrt(recording.camera.fx * recording.camera.fy)
     mean, _, valid = motion(twists.t, extrapolate=True)
     mean = np.where(valid[:, None], mean, np.nan)
@@ -239,7 +239,7 @@ def prepare_gyro_reference(
         return ReferenceMotion(truth, source)
     estimate, measured = estimated.mean[rows], truth.values[rows]
     axes = find_gyro_axes(motion, truth)
-    truth = dataclasses.replace(truth, guesses_axes=False)  # the note is enough
+    truth = dataclasses.replace(truth, assumes_camera_axes=False)  # the note is enough
     if axes is not None:
         notes.append(
             f"the gyro is like the estimate in other axes: give --imu-rotation {axes} if they are "

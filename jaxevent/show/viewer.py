@@ -71,7 +71,11 @@ def view(
 
 @contextlib.contextmanager
 def _stream(out: Path | None) -> Iterator[Any]:
-    """Open a stream to the viewer, or to a file that appears when complete."""
+    """Open a stream to the viewer, or to a file that appears when complete.
+
+    Rerun's own thread for files waits forever at a full disk, so the file is written here, at once:
+    parts that are read one by one have indices that no longer hold in the whole.
+    """
     rerun: Any = require("rerun", "view")
     stream = rerun.RecordingStream("jaxevent")
     if out is None:
@@ -82,10 +86,9 @@ def _stream(out: Path | None) -> Iterator[Any]:
     if out.suffix != ".rrd":
         raise InputError(f"{out}: the viewer opens files that end in .rrd; rename it")
     with complete(out) as partial:
-        stream.save(partial)
+        sent = stream.binary_stream()
         yield stream
-        stream.flush()
-        stream.disconnect()
+        partial.write_bytes(sent.read())
 
 
 class _Sender:

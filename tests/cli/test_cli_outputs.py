@@ -13,6 +13,7 @@ from noise import ONE, small, write_config
 
 import jaxevent
 from jaxevent import cli
+from jaxevent.cli import arguments
 from jaxevent.egomotion.truth import known_motion
 from jaxevent.io import output
 from jaxevent.register.geometry import read_homography
@@ -225,6 +226,22 @@ def test_what_another_process_writes_is_refused(folder, capsys):
         fails(capsys, ["convert", "source.h5", "a.h5", "--force"], "another process")
     assert state(folder).keys() == before.keys() | {folder / "a.h5"}
     assert not output.partials(folder / "a.h5")
+
+
+@pytest.mark.parametrize("more", [[], ["--force"]])
+def test_an_output_is_claimed_before_the_work_begins(more, folder, capsys, monkeypatch):
+    """A command that begins while another one reads its input does not write the same output."""
+    argv, read = ["convert", "source.h5", "a.h5"], arguments.open_recording
+
+    def read_meanwhile(*given, **options):
+        monkeypatch.setattr(arguments, "open_recording", read)
+        fails(capsys, [*argv, *more], "a.h5: is being written by another process")
+        return read(*given, **options)
+
+    monkeypatch.setattr(arguments, "open_recording", read_meanwhile)
+    before = state(folder)
+    assert cli.main(argv) == 0
+    assert state(folder).keys() == before.keys() | {folder / "a.h5"}
 
 
 def test_a_fit_has_its_folder_alone(folder, capsys):

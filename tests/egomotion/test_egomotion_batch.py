@@ -114,7 +114,7 @@ def test_warp_of_a_rigid_scene():
     D = rng.normal(size=(3, 3))
     more = np.zeros((N_COEFFICIENT_ROWS - 3, 3))
     path = Path(np.append(O, more, 0), np.append(D, more, 0), np.zeros(1))
-    C = path.coefficients()[1]
+    C = path.derivatives()[1]
     np.testing.assert_allclose(C[1], D[1] + np.cross(O[0], D[0]))
     tau = rng.uniform(-0.15, 0.15, 50)
     powers = np.stack([tau, tau**2 / 2, tau**3 / 6, tau**4 / 24, tau**5 / 120], 1)
@@ -132,13 +132,13 @@ def test_warp_of_a_rigid_scene():
 def test_prediction_of_a_path():
     """Twists are the same where windows overlap, to a polynomial's accuracy; beyond they stay."""
     path = true_path(np.zeros(1))
-    heading, Omega = path.twist(np.array([-0.1, 0.0, 0.1]))
+    heading, Omega = path.unit_twist(np.array([-0.1, 0.0, 0.1]))
     np.testing.assert_allclose(Omega, np.broadcast_to(OMEGA, (3, 3)))
     np.testing.assert_allclose(heading, np.broadcast_to(path.D[0], (3, 3)), atol=2e-3)
     path.O[1], path.O[2], path.D[1] = 2.0, -10.0, [1.0, -2.0, 0.5]
     t = np.linspace(-0.15, 0.15, 31)
     for tau in (0.0, 0.05, -0.05):
-        T, Omega = path.twist(np.clip(t + tau, -0.15, 0.15))
+        T, Omega = path.unit_twist(np.clip(t + tau, -0.15, 0.15))
         heading, turn = predict_path(path, tau, 0.15).twist(t)
         np.testing.assert_allclose(turn, Omega, atol=0.03 if tau else 1e-3)
         np.testing.assert_allclose(heading, T, atol=0.03 if tau else 1e-3)
@@ -177,7 +177,7 @@ def data_of(most: int = 8192) -> tuple[PixelSeries, Prior]:
 def test_the_motion_of_a_window_is_found():
     """As far as 96 x 72 pixels tell it: a heading beside a turn, and a turn beside a heading."""
     fit = fitted()
-    heading, Omega = (part[0] for part in fit.path.twist(0.0))
+    heading, Omega = (part[0] for part in fit.path.unit_twist(0.0))
     assert np.degrees(np.arccos(heading @ T / np.linalg.norm(T))) < 15
     assert np.linalg.norm(Omega - OMEGA) < 0.35 * np.linalg.norm(OMEGA)
     assert fit.agreement > 0.5 and np.isfinite(fit.covariance).all()
@@ -201,7 +201,7 @@ def test_the_motion_before_a_wall_is_found():
     made = initialise.planar_solutions(near)
     found = windows.planar_hypotheses(150_000, made)
     assert len(found) == 2 and found[0][1].cost < found[1][1].cost
-    heading, turn = found[0][0].path.twist(0.0)
+    heading, turn = found[0][0].path.unit_twist(0.0)
     assert np.degrees(np.arccos(heading[0] @ T / np.linalg.norm(T))) < 1
     assert np.linalg.norm(turn[0] - OMEGA) < 0.02 * np.linalg.norm(OMEGA)
     # Depths are the plane's; those smaller than the least were not.
@@ -385,7 +385,7 @@ def test_the_photometric_fit_ends_at_the_truth():
     scene = Scene(normalise(path), np.zeros(series.shape), 0.0)
     for sigma, map_steps, steps in ((0.3, 2, 12), (0.2, 0, 15), (0.05, 0, 15)):
         scene, report = adjust(series, scene, prior, sigma, map_steps, steps)
-    heading, Omega = (part[0] for part in scene.path.twist(0.0))
+    heading, Omega = (part[0] for part in scene.path.unit_twist(0.0))
     assert np.degrees(np.arccos(heading @ T / np.linalg.norm(T))) < 3
     assert np.linalg.norm(Omega - OMEGA) < 0.06 * np.linalg.norm(OMEGA)
     assert report.noise < 0.05 and report.inliers > 0.9
@@ -473,7 +473,7 @@ def test_the_covariance_is_that_of_repeated_fits():
         tau = series.tau + 5e-3 * rng.normal(size=len(series.tau))
         noisy = series._replace(tau=tau)
         scene, _ = adjust(noisy, scene_of(fitted()), prior, 0.2, 1, 6)
-        rows.append(np.concatenate([part[0] for part in scene.path.twist(0.0)]))
+        rows.append(np.concatenate([part[0] for part in scene.path.unit_twist(0.0)]))
         if len(told) < 2:  # they are alike
             told.append(np.diag(compute_covariance(noisy, scene, prior, sigma=0.2)))
     ratio = np.var(rows, 0, ddof=1).sum() / np.mean(told, 0).sum()
@@ -502,7 +502,7 @@ def test_priors_pull():
     )  # fmt: skip
     prior = windows.prior(150_000, 0.15)
     scene, _ = adjust(series, scene_of(fitted()), prior, 0.1, 0, 8)
-    np.testing.assert_allclose(scene.path.twist(0.0)[1][0], wrong, atol=1e-2)
+    np.testing.assert_allclose(scene.path.unit_twist(0.0)[1][0], wrong, atol=1e-2)
     covariance = compute_covariance(series, scene, prior, sigma=0.1)
     assert np.sqrt(np.diag(covariance)[3:]).max() < 1e-4
 
@@ -574,7 +574,7 @@ def test_the_end_of_a_path_is_less_sure():
     np.testing.assert_allclose(heading, np.tile(1e-4 / pace[:, None] ** 2, 3), rtol=1e-6)
     np.testing.assert_allclose(slower.covariance[:, 5, 5], grown)
     path.D[1, 2] = -8.0  # it stands still after 1 / 8 s
-    stops = path.twist(np.array([0.0, 0.125]))[0]
+    stops = path.unit_twist(np.array([0.0, 0.125]))[0]
     np.testing.assert_array_equal(stops, [[0, 0, 1], [0, 0, 0]])
 
 
@@ -659,7 +659,7 @@ def test_a_wrong_beginning_is_fitted_again(monkeypatch, cheaper):
     params = Params.of({**GIVEN, "half_window": 0.05, "step": 0.05, "fresh": 3})
     motion = sequence.batch.estimate(recording, params)
     at = np.searchsorted(motion.t, first + 50_000 * np.arange(4))
-    along = motion.mean[at, :3] @ right.twist(0.0)[0].ravel()
+    along = motion.mean[at, :3] @ right.unit_twist(0.0)[0].ravel()
     assert (along > 0).tolist() == [cheaper == "all", *2 * [cheaper != "none"], True]
 
 

@@ -12,7 +12,7 @@ from traced import FULL, products
 from jaxevent.camera import PinholeCamera
 from jaxevent.egomotion import geometry, scores
 from jaxevent.egomotion.models import General
-from jaxevent.egomotion.truth import from_gyro, from_poses, gyro_bias
+from jaxevent.egomotion.truth import gyro_bias, twists_from_gyro, twists_from_poses
 from jaxevent.errors import InputError
 from jaxevent.recording import Imu, Poses
 
@@ -192,7 +192,7 @@ def test_truth_of_sampled_poses(span):
     poses = poses_of(xi, t)
     # A quaternion's sign says nothing.
     poses.quaternion[::3] *= -1
-    measured = from_poses(poses, span)
+    measured = twists_from_poses(poses, span)
     at_T, at_Omega = measured(np.array([t[0], t[7] + 1, t[-1]]))
     assert at_T is not None
     np.testing.assert_allclose(at_T, np.tile(T, (3, 1)), atol=1e-6)
@@ -200,14 +200,14 @@ def test_truth_of_sampled_poses(span):
     with pytest.raises(InputError, match="known from"):
         measured(t[-1:] + 1)
     with pytest.raises(InputError, match="none 9.0 s apart"):
-        from_poses(poses, 9.0)
+        twists_from_poses(poses, 9.0)
 
 
 def test_repeated_pose_times_are_passed_over():
     t = np.array([0, 5000, 5000, 10000])
     poses = poses_of(np.r_[T, OMEGA], t)
     poses.position[1] += 5
-    measured = from_poses(poses[1:])
+    measured = twists_from_poses(poses[1:])
     assert measured.T is not None
     np.testing.assert_allclose(measured.T, [T], atol=1e-9)
 
@@ -219,11 +219,11 @@ def test_gyro():
     rates = np.where(t[:, None] < 50_000, 0, OMEGA * (t[:, None] - 50_000) * 1e-5)
     imu = Imu(t, rates @ R + bias, np.zeros((100, 3)))
     np.testing.assert_allclose(gyro_bias(imu, 0, 0.05), bias, atol=1e-12)
-    none, Omega = from_gyro(imu, gyro_bias(imu, 0, 50_000), R)(np.array([0.01, 0.0705]))
+    none, Omega = twists_from_gyro(imu, gyro_bias(imu, 0, 50_000), R)(np.array([0.01, 0.0705]))
     assert none is None
     np.testing.assert_allclose(Omega, [np.zeros(3), OMEGA * 0.205], atol=1e-12)
     with pytest.raises(InputError, match="is no rotation"):
-        from_gyro(imu, bias, -np.eye(3))
+        twists_from_gyro(imu, bias, -np.eye(3))
     with pytest.raises(InputError, match="no gyro sample"):
         gyro_bias(imu, 1.0, 2.0)
 

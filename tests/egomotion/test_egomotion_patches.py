@@ -378,17 +378,17 @@ def test_a_gyro_in_other_axes_and_with_a_bias():
         found = truth.find_imu_axes(Omega, measured)
         assert found == (None if name == "camera" else name)
         imu = Imu(np.rint(1e6 * t).astype(np.int64), measured, np.zeros_like(measured))
-        np.testing.assert_allclose(truth.from_gyro(imu, rotation=R).Omega, Omega + bias)
-    # Axes without a name are told as `imu_rotation` reads them.
+        np.testing.assert_allclose(truth.twists_from_gyro(imu, rotation=R).Omega, Omega + bias)
+    # Axes without a name are told as `parse_imu_rotation` reads them.
     R = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
     found = truth.find_imu_axes(Omega, (Omega + bias) @ R)
     assert found is not None
-    np.testing.assert_array_equal(truth.imu_rotation(found), R)
-    np.testing.assert_array_equal(truth.imu_rotation("y-up"), np.diag([1.0, -1, -1]))
-    np.testing.assert_array_equal(truth.imu_rotation("0,1,0,0,0,1,1,0,0")[0], [0, 1, 0])
+    np.testing.assert_array_equal(truth.parse_imu_rotation(found), R)
+    np.testing.assert_array_equal(truth.parse_imu_rotation("y-up"), np.diag([1.0, -1, -1]))
+    np.testing.assert_array_equal(truth.parse_imu_rotation("0,1,0,0,0,1,1,0,0")[0], [0, 1, 0])
     for wrong in ("y_up", "1,2", "1,0,0,0,1,0,0,0,-1"):
         with pytest.raises(InputError, match="imu-rotation"):
-            truth.imu_rotation(wrong)
+            truth.parse_imu_rotation(wrong)
 
 
 def test_a_bias_in_degrees_is_told():
@@ -396,10 +396,10 @@ def test_a_bias_in_degrees_is_told():
     rates = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3)) + [0.0, 0.0, 3.0]
     imu = Imu(t, rates, np.zeros_like(rates))
     for bias in ([0.0, 0.0, 0.0], [0.19, -0.05, 0.1], [0.4, 0.0, 3.1]):
-        np.testing.assert_allclose(truth.from_gyro(imu, bias).Omega, rates - bias)
+        np.testing.assert_allclose(truth.twists_from_gyro(imu, bias).Omega, rates - bias)
     for degrees in ([60.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 6.0]):
         with pytest.warns(InputWarning, match="give it in rad/s: numpy.radians converts deg/s"):
-            truth.from_gyro(imu, degrees)
+            truth.twists_from_gyro(imu, degrees)
 
 
 @pytest.mark.parametrize("name", ["camera", "y-up", "turned"])

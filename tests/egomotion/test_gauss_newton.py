@@ -62,7 +62,7 @@ def test_jacobian_of_coefficients(k):
     powers = HALF ** np.arange(1, N_COEFFICIENT_ROWS + 1)
 
     def coefficients(at: Path) -> np.ndarray:
-        both = np.stack(at.polynomials()) * powers[:, None]
+        both = np.stack(at.polynomial_coefficients()) * powers[:, None]
         return both.transpose(0, 2, 1).ravel()
 
     found, h = warp.coefficient_jacobian(path, unit, HALF, k), 1e-6

@@ -462,6 +462,18 @@ def test_npz_round_trip(recording, seconds, compressed):
         assert_same(load(path / "random.npz"), want)
 
 
+def test_npz_takes_colours_as_arrays_are(tmp_path):
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 256, (2, 4, 6, 3), np.uint8)
+    columns = {"t": np.arange(3) * 5_000, "x": [1, 2, 3], "y": [0, 1, 2], "p": [0, 1, 1]}
+    np.savez(tmp_path / "a.npz", **columns, frames=frames, frame_t=[1_000, 9_000])
+    read = load(tmp_path / "a.npz", time_unit="us")
+    made = Recording.from_arrays(**columns, frames=frames, frame_times=[1_000, 9_000])
+    assert (read.width, read.height) == (6, 4)
+    np.testing.assert_array_equal(read.frames.images, made.frames.images)
+    np.testing.assert_array_equal(read.extra["rgb"], made.extra["rgb"])
+
+
 def test_npz_size_from_frames_and_times_without_exposure(tmp_path):
     arrays = npz_arrays(random_recording(3, events=5, frames=2))
     for name in ("width", "height", "exp_start", "exp_end"):
@@ -490,7 +502,7 @@ def test_npz_size_from_frames_and_times_without_exposure(tmp_path):
         (dict(p=np.array([0, 1, 5], np.uint8)), "event 2 has the polarity 5"),
         (dict(t=[], x=[], y=[], p=[]), "holds no event and no frame"),
         (dict(frames=np.zeros((2, 3, 4), np.uint8)), "frames have no times; add frame_t"),
-        (dict(frames=np.zeros((3, 4), np.uint8), frame_t=[1]), r"frames has shape \(3, 4\)"),
+        (dict(frames=np.zeros((3, 4), np.uint8), frame_t=[1]), r"frames have the shape \(3, 4\)"),
         (dict(frames=np.zeros((1, 3, 9)), frame_t=[1]), r"frames have shape \(1, 3, 9\)"),
         (dict(frames=np.full((1, 3, 4), np.nan), frame_t=[1]), "frame 0 holds NaN"),
         (dict(frames=np.zeros((1, 3, 4), int), frame_t=[1]), "frames are int64"),

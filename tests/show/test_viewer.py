@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import types
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -41,10 +42,13 @@ class Stream:
     layout: Kind
 
     def __init__(self, name):
-        self.time, self.path = None, None
+        self.time = None
 
-    def save(self, path):
-        self.path = path
+    def binary_stream(self):
+        return self
+
+    def read(self):
+        return b"complete"
 
     def spawn(self):
         Stream.sent.append(("viewer", None, None))
@@ -62,10 +66,6 @@ class Stream:
         Stream.layout = blueprint
 
     def flush(self):
-        if self.path:
-            self.path.write_text("complete")
-
-    def disconnect(self):
         pass
 
 
@@ -159,6 +159,15 @@ def test_what_cannot_be_shown_is_told(sent, tmp_path, monkeypatch):
     with pytest.raises(MissingExtra, match="view"):
         view(seen())
     assert not list(tmp_path.glob("*.rrd"))
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device without room")
+def test_a_full_disk_is_told_in_one_sentence(sent, tmp_path, monkeypatch):
+    write = Path.write_bytes
+    monkeypatch.setattr(Path, "write_bytes", lambda path, data: write(Path("/dev/full"), data))
+    with pytest.raises(InputError, match="a.rrd: cannot be written .No space.*enough room"):
+        view(seen(), out=tmp_path / "a.rrd")
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_command(sent, tmp_path, capsys, monkeypatch):

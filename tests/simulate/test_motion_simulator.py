@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 from scipy.ndimage import map_coordinates
 
 from jaxevent import simulate as sim
-from jaxevent.egomotion import from_poses
+from jaxevent.egomotion import twists_from_poses
 from jaxevent.errors import InputError
 
 pytestmark = pytest.mark.slow
@@ -42,14 +42,14 @@ def test_truth_from_the_recorded_poses():
     world = sim.BoxWorld((-5, -5, -5), (5, 5, 5), box)
     for motion, tolerance in ((sim.CameraMotion(SWINGING.mean), 1e-6), (SWINGING, 2e-2)):
         source = sim.MovingCamera(world, motion, SIZE, 50, duration=0.3)
-        twists = from_poses(source.poses())
+        twists = twists_from_poses(source.poses())
         T, Omega = source.twist(twists.t)
         assert twists.T is not None
         np.testing.assert_allclose(twists.T, T, atol=tolerance)
         np.testing.assert_allclose(twists.Omega, Omega, atol=tolerance)
     errors = []
     for rate in (100.0, 200.0):
-        twists = from_poses(source.poses(rate))
+        twists = twists_from_poses(source.poses(rate))
         errors.append(np.abs(twists.Omega - source.twist(twists.t)[1]).max())
     assert 3.5 < errors[0] / errors[1] < 4.5  # second order
 

@@ -17,7 +17,7 @@ from scipy import ndimage
 from jaxevent.blob.search.config import CONFIG
 from jaxevent.blob.search.stream import CountedSpans, Stream, cell_at
 from jaxevent.codegen import njit_noalloc_inlined
-from jaxevent.events.filters import busiest_neighbour
+from jaxevent.events.filters import max_neighbour_count
 
 N_TIME_SLICES = 64  # equal parts of the recording's time
 CELL_PX, FINE_CELL_PX = 16, 4  # px, sides of cells; fine ones where the background is bright
@@ -352,7 +352,7 @@ def find_hot_pixels(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
     A hot pixel has four times the events of its strongest neighbour, and more than chance gives to
     one pixel of a thousand recordings. `counts` (rows, columns) are events.
     """
-    mu = np.maximum(busiest_neighbour(counts), 1.0)
+    mu = np.maximum(max_neighbour_count(counts), 1.0)
     return (counts > 4 * mu) & (clutter_evidence(counts, mu, 1) > np.log(counts.size) + 7)
 
 

@@ -889,7 +889,7 @@ contrast = HostEstimator(
     Params,
     solve,
     linear=True,
-    lengths=adapt_lengths,
+    adapt_lengths=adapt_lengths,
     about="The motion that makes the image of warped events sharpest (Gallego et al., CVPR 2018), "
     "in overlapping windows of time, each by itself.",
 )

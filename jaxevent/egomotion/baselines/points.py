@@ -374,7 +374,7 @@ frames = PointTracker(
     "frames",
     Params,
     solve,
-    lengths=adapt_lengths,
+    adapt_lengths=adapt_lengths,
     about="Motion from frames alone: points tracked by Lucas and Kanade's method determine the "
     "motion between each two frames, general motion by the five-point method. It needs OpenCV.",
 )

@@ -485,7 +485,7 @@ def differentiate_residuals(series, samples, motion, field, free, jacobian):
         slope = (gx * dx + gy * dy) / max(1 - lx * dx - ly * dy, warp.MIN_RAY_DERIVATIVE)
         hx, hy = gx + slope * lx, gy + slope * ly
         here = samples.inside[e]
-        by = warp.coefficient_gradient(motion, t, (rx, ry), rho, here * hx, here * hy)
+        by = warp.pose_gradient(motion, t, (rx, ry), rho, here * hx, here * hy)
         for n in range(6):
             jacobian.base[n, e] = by[n]
         by_depth = here * (hx * dx + hy * dy)

@@ -36,7 +36,7 @@ def estimate_motion(params: Params, given: HostInputs) -> MotionEstimate:
     Args:
         params: Parameters.
         given: Recording, camera, seed of the choice of events, and the option `gyro`
-            (`truth.from_gyro`), which gives Omega.
+            (`truth.twists_from_gyro`), which gives Omega.
 
     Returns:
         The motion, lost at times that no window determines.
@@ -193,10 +193,10 @@ def _blend(
             continue
         far = np.minimum(np.abs(t[near] - centre) / max(reach, 1), 1)
         weight = np.maximum(np.cos(np.pi / 2 * far) ** 2, 1e-3)
-        T, turn = fit.path.twist((t[near] - centre) * 1e-6)
+        T, turn = fit.path.unit_twist((t[near] - centre) * 1e-6)
         heading[near] += weight[:, None] * T
         Omega[near] += weight[:, None] * turn
-        way = np.concatenate([T, turn], 1) - np.concatenate(fit.path.twist(0.0), 1)
+        way = np.concatenate([T, turn], 1) - np.concatenate(fit.path.unit_twist(0.0), 1)
         way = (
             WINDOW_END_SIGMA_PER_CHANGE
             * way
@@ -275,7 +275,7 @@ def _disagreements(
         if one is None or other is None or way >= 2 * half:
             continue
         before, after = (
-            np.concatenate(fit.path.twist(0.5e-6 * side), 1)[0]
+            np.concatenate(fit.path.unit_twist(0.5e-6 * side), 1)[0]
             for fit, side in ((one, way), (other, -way))
         )
         square = np.outer(after - before, after - before)
@@ -301,7 +301,7 @@ batch = HostEstimator(
     estimate_motion,
     models=(General.name,),
     options=COMMON_OPTIONS | {"gyro"},
-    lengths=adapt_lengths,
+    adapt_lengths=adapt_lengths,
     about="General motion by fitting a whole window of events: the camera's path and the scene's "
     "depth. Estimates of overlapping windows are blended, a fifth of a `step` apart.",
 )

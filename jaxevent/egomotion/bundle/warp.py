@@ -27,9 +27,7 @@ N_WINDOW_SEGMENTS = 8  # of a window, at whose middles a gyro's prior acts
 MIN_RELATIVE_PLANE_RHO = 0.1  # least inverse depth of a plane, by the median one
 MAX_RAY_SAMPLES = 16  # depths that are tried on a ray
 RAY_STEP_PX = 1.0  # between them, unless that takes more of them
-NEWTON_TOLERANCE_LOG_DEPTH = (
-    0.01  # log depth; a larger second step of Newton starts a search of the ray
-)
+MAX_NEWTON_STEP_LOG_DEPTH = 0.01  # a larger second step of Newton starts a search of the ray
 MIN_RAY_DERIVATIVE = 0.3  # of log depth less that of the scene, along an event's ray
 MAX_PATH_STEP_PX = 4.0  # at the window's end, that one Gauss-Newton step of a path moves the image
 MAX_LOG_DEPTH_STEP = 0.5  # of log depth, in one step
@@ -248,8 +246,7 @@ def bilinear_corner(x, y, grid):
 
     Returns:
         Number of the node above and to the left, counted row by row, and the distance from it to
-            the
-        right and downwards, 0 to 1 nodes.
+            the right and downwards, 0 to 1 nodes.
     """
     i = min(max((x - grid.x) / grid.node, 0.0), grid.columns - 1.001)
     j = min(max((y - grid.y) / grid.node, 0.0), grid.rows - 1.001)
@@ -361,7 +358,7 @@ def project(points, motion, field, log_rho, out):
         if here > -np.inf:
             here = _newton_step(field, ray, here)
             new = _newton_step(field, ray, here)
-        if not abs(new - here) < NEWTON_TOLERANCE_LOG_DEPTH:
+        if not abs(new - here) < MAX_NEWTON_STEP_LOG_DEPTH:
             k = bilinear_corner(rx, ry, field.grid)[0]
             top, bottom = field.nearest[k] + 0.02, field.farthest[k] - 0.02
             new = _first_intersection(field, ray, top, bottom)
@@ -372,8 +369,8 @@ def project(points, motion, field, log_rho, out):
 
 
 @njit_fastmath_inlined
-def coefficient_gradient(motion, tau, ray, rho, hx, hy):
-    """Return the gradient of hx X + hy Y by phi and C, (X, Y) the end of an event's ray.
+def pose_gradient(motion, tau, ray, rho, hx, hy):
+    """Return the gradient of hx X + hy Y by the pose phi and C, (X, Y) the end of an event's ray.
 
     For a rotation dR x = J dphi x R x, J the left Jacobian of phi; J' w = w - one phi x w + two phi
     x (phi x w).
@@ -426,7 +423,7 @@ def point_derivatives(points, rho, motion, by, by_depth):
         by_depth[e, 0], by_depth[e, 1] = rho[e] * dx, rho[e] * dy
         for axis in range(2):
             h = 1.0 - axis
-            six = coefficient_gradient(motion, tau[e], (rx, ry), rho[e], h, 1.0 - h)
+            six = pose_gradient(motion, tau[e], (rx, ry), rho[e], h, 1.0 - h)
             for n in range(6):
                 by[e, n, axis] = six[n]
 
@@ -459,8 +456,8 @@ class Path:
         O[0], D[0] = Omega, heading
         return cls(O, D, log_rho)
 
-    def coefficients(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the derivatives O of Omega and C of the position at tau = 0."""
+    def derivatives(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return Omega and its derivatives, and those of C from the first on, at tau = 0."""
         constant, turn = [self.D[0]], cross_matrix(self.O[0])
         for _ in self.D[1:]:
             constant.append(turn @ constant[-1])
@@ -468,18 +465,18 @@ class Path:
         C[1:] += self.D[1:]
         return self.O, C
 
-    def polynomials(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the factors of tau, tau^2, ... in phi and C."""
-        O, C = self.coefficients()  # noqa: E741
+    def polynomial_coefficients(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the factors of tau, tau^2, ... in phi and C, (rows, 3) each."""
+        O, C = self.derivatives()  # noqa: E741
         factorials = np.array([math.factorial(k + 1) for k in range(len(O))])[:, None]
         return O / factorials, C / factorials
 
     def motion(self, f: float) -> CameraMotion:
         """Return the polynomials for compiled functions, with the focal length f (px)."""
-        return CameraMotion(*self.polynomials(), f)
+        return CameraMotion(*self.polynomial_coefficients(), f)
 
-    def twist(self, tau: float | int | NDArray) -> tuple[NDArray, NDArray]:
-        """Return unit heading R' C' and Omega to second order, (times, 3) each, at tau (s).
+    def unit_twist(self, tau: float | int | NDArray) -> tuple[NDArray, NDArray]:
+        """Return the heading, T of length 1, and Omega (rad/s), (times, 3) each, at tau (s).
 
         The heading is 0 at times at which the camera stands still.
         """
@@ -495,7 +492,7 @@ class Path:
         """Return T in units of |C1|, and Omega (rad/s), (times, 3) each, at tau (s)."""
         from scipy.spatial.transform import Rotation
 
-        O, C = self.coefficients()  # noqa: E741
+        O, C = self.derivatives()  # noqa: E741
         tau = np.atleast_1d(np.asarray(tau, np.float64))
         powers = _taylor_powers(tau, 0, len(O))
         turns = Rotation.from_rotvec(_taylor_powers(tau, 1, len(O)) @ O)
@@ -622,7 +619,7 @@ def predict_path(path: Path, tau: float, half: float) -> Path:
     O = np.linalg.lstsq(powers, Omega, rcond=None)[0]  # noqa: E741
     turned = Rotation.from_rotvec(_taylor_powers(t, 1, n) @ O).apply(velocity)
     C = np.linalg.lstsq(powers, turned, rcond=None)[0]
-    # The inverse of `coefficients`.
+    # The inverse of `derivatives`.
     D, constant, turn = [C[0]], C[0], cross_matrix(O[0])
     for row in C[1:]:
         constant = turn @ constant

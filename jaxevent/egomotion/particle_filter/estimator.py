@@ -834,7 +834,7 @@ def candidate_range(
 voting = VotingEstimator(
     "voting",
     Params,
-    lengths=adapt_lengths,
+    adapt_lengths=adapt_lengths,
     options=COMMON_OPTIONS | {"causal", "smooth", "cloud", "compiler"},
     about="Motion by voting: a particle filter whose likelihood is the vote of the earlier "
     "neighbours of events (Egomotion thesis, chapters 5 and 6, with soft votes of all neighbours).",

@@ -26,7 +26,7 @@ from jaxevent.reconstruction.compensated.warp import PathTimes
 MIN_DEVIATION_PX = 0.25
 COARSE_LEVELS, FINE_LEVELS = (4, 3, 2), (2, 1)  # to see whether there is any, and to measure it
 SEARCH_LEVEL, SEARCH_REACH = 2, 4  # resolution of the search, and how far it goes, in its pixels
-N_STEPS = 4  # at each level
+N_STEPS_PER_LEVEL = 4  # Gauss-Newton steps
 MAX_STEP_PX = 2.0  # at each level, in its pixels
 LEAST_STEP_PX = 0.03
 MIN_INFORMATION = 1e-3  # of the sum along both axes, along the axis that images show least
@@ -127,7 +127,7 @@ def _register(
     for level in levels:
         images = PackedImages.of(pyramid[level][k : k + 2], times)
         nodes = np.zeros((*node_shape(*pyramid.image_shape, level), 4), np.float32)
-        for _ in range(N_STEPS):
+        for _ in range(N_STEPS_PER_LEVEL):
             nodes[..., :2] = moved / 2**level
             equations = linearise(images, nodes, cost)
             xx, xy, _, _, yy = equations.N[..., :5].sum((0, 1), dtype=float)

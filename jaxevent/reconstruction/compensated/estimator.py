@@ -99,7 +99,7 @@ class PreparedTarget(NamedTuple):
         rows: Indices of its instants among all.
         layout: Layout of its instants.
         noise_rows: Rows of `PreparedTargets.noise` of its instants.
-        noise_shape: See `event_noise.InstantPlaces.shape`.
+        noise_shape: See `event_noise.IntervalPositions.shape`.
         p: Trajectories of nodes, px.
         path_index: Flat index of the pixel whose path each pixel takes.
         exposures: Exposures of the frames next to the target.

@@ -1,4 +1,4 @@
-"""Noise of events beside that of the model, measured where frames tell what happened.
+"""Noise of events in excess of the model's, measured by the change between frames.
 
 Events that are lost, of wrong sign, at another place or at another time do not add up to the change
 between two frames. Between the frames k and k + 1, for every pixel,
@@ -36,19 +36,19 @@ from jaxevent.recording import Recording
 
 REGION_SIGMA_PX = 8.0  # of the Gaussian of the mean around a pixel
 N_CACHED_INTERVALS = 16
-BEYOND_SHAPE = np.float32(0.25)  # in the place of w (1 - w), beyond the frames
+EXTRAPOLATION_SHAPE = np.float32(0.25)  # w (1 - w) before the first and after the last frame
 
 
 class IntervalNoise(NamedTuple):
-    """The noise of the events between two frames beside that of the model."""
+    """Noise of the events between two frames in excess of the model's."""
 
     factor: Float[Numeric, "*intervals h w"]  # on the variance of images between the frames
     excess: Float[Numeric, "*intervals h w"]  # added to it halfway, times 4, (ln I)^2
     trust: Float[Numeric, "*intervals"]  # 0..1
 
 
-class InstantPlaces(NamedTuple):
-    """Places of instants between frames."""
+class IntervalPositions(NamedTuple):
+    """Positions of instants in the intervals between frames."""
 
     interval: Int[Numeric, " k"]  # index of the frame before, of the nearest interval beyond
     shape: Float[Numeric, " k"]  # w (1 - w); 0 at frames
@@ -60,7 +60,7 @@ def inflate_variances(V: Numeric, noise: IntervalNoise, shape: Numeric) -> Numer
     Args:
         V: (K, h, w) variances, (ln I)^2.
         noise: Noise of the intervals of the K images.
-        shape: (K,) as of `InstantPlaces`.
+        shape: (K,) as of `IntervalPositions`.
 
     Returns:
         (K, h, w), those of images at frames as they are.
@@ -70,7 +70,7 @@ def inflate_variances(V: Numeric, noise: IntervalNoise, shape: Numeric) -> Numer
 
 
 class EventNoise:
-    """Measures the noise of events between the frames of a recording: `noise = measure(interval)`.
+    """Noise of the events between a recording's frames: `noise = event_noise(interval)`.
 
     Args:
         recording: The recording.
@@ -90,16 +90,16 @@ class EventNoise:
         self._frames = frames
         self._cache: collections.OrderedDict[int, IntervalNoise] = collections.OrderedDict()
 
-    def locate(self, times: NDArray[np.int64]) -> InstantPlaces:
+    def locate(self, times: NDArray[np.int64]) -> IntervalPositions:
         """Locate times (us) between the frames."""
         frames, last = self._frames, max(len(self._frames) - 2, 0)
         interval = (np.searchsorted(frames, times, "right") - 1).clip(0, last)
         if not last and len(frames) < 2:
-            return InstantPlaces(interval, np.full(len(times), BEYOND_SHAPE))
+            return IntervalPositions(interval, np.full(len(times), EXTRAPOLATION_SHAPE))
         begin, end = frames[interval], frames[interval + 1]
         w = ((times - begin) / (end - begin)).astype(np.float32)
-        shape = np.where((times < begin) | (times > end), BEYOND_SHAPE, w * (1 - w))
-        return InstantPlaces(interval, shape)
+        shape = np.where((times < begin) | (times > end), EXTRAPOLATION_SHAPE, w * (1 - w))
+        return IntervalPositions(interval, shape)
 
     def __call__(self, interval: int) -> IntervalNoise:
         """Return the noise of the events after a frame, by the index of the frame."""
