@@ -7,6 +7,7 @@ from typing import Any
 
 from jaxevent.cli import arguments
 from jaxevent.cli.arguments import command, show_progress
+from jaxevent.display import format_count
 
 
 def add(commands: Any) -> None:
@@ -82,4 +83,4 @@ def run(
     clock = time.perf_counter()
     write(flow_from_events(recording, values, causal=causal), chosen, out, show_progress())
     seconds = time.perf_counter() - clock
-    print(f"{out}: flow at {len(chosen):,} times, {seconds:.2f} s")
+    print(f"{out}: flow at {format_count(len(chosen), 'time')}, {seconds:.2f} s")

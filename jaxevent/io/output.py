@@ -192,26 +192,27 @@ def locked(path: Path) -> Iterator[bool]:
 
 
 @contextlib.contextmanager
-def claim_outputs(outputs: Sequence[Path]) -> Iterator[list[Path]]:
+def claim_outputs(outputs: Sequence[Path]) -> Iterator[dict[Path, Path | OSError]]:
     """Claim outputs for a command that writes them later; `check_outputs` refuses them to others.
-
-    An output that cannot be claimed, as in a folder that does not exist, is left out.
 
     Args:
         outputs: Files or folders to be written.
 
     Yields:
-        Locked siblings of the outputs, which are removed after the block.
+        For each output a locked sibling, which is removed after the block, or the error of an
+        output that cannot be written, as in a folder that does not exist.
     """
-    claims: list[Path] = []
+    claims: dict[Path, Path | OSError] = {}
     with contextlib.ExitStack() as stack:
-        for out in (path.absolute() for path in outputs if path.absolute().name):
-            claim = partial_path(out)
+        for out in (path for path in outputs if path.absolute().name):
+            claim = partial_path(out.absolute())
             stack.callback(_remove, claim)
-            with contextlib.suppress(OSError):
+            try:
                 claim.touch(exist_ok=False)
                 stack.enter_context(locked(claim))
-                claims.append(claim)
+                claims[out] = claim
+            except OSError as error:
+                claims[out] = error
         yield claims
 
 
@@ -323,6 +324,14 @@ def allow_writing_into_folders(allowed: bool) -> Iterator[None]:
         _into_folders.reset(token)
 
 
+def unwritable(path: Path, error: OSError) -> InputError:
+    """Return the error of an output that cannot be written."""
+    reason = " ".join((error.strerror or str(error)).split())
+    return InputError(
+        f"{path}: cannot be written ({reason}); choose a writable place with enough room"
+    )
+
+
 @contextlib.contextmanager
 def complete(path: Path, directory: bool = False) -> Iterator[Path]:
     """Yield a temporary sibling of `path`, renamed onto `path` if the block succeeds.
@@ -368,10 +377,7 @@ def complete(path: Path, directory: bool = False) -> Iterator[Path]:
             raise InputError(str(error).replace(str(partial), str(path))) from error
         raise
     except OSError as error:
-        reason = " ".join((error.strerror or str(error)).split())
-        raise InputError(
-            f"{path}: cannot be written ({reason}); choose a writable place with enough room"
-        ) from error
+        raise unwritable(path, error) from error
     finally:
         _remove(unlocked)
         _remove(partial)

@@ -228,6 +228,16 @@ def test_what_another_process_writes_is_refused(folder, capsys):
     assert not output.partials(folder / "a.h5")
 
 
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_missing_folder_is_told_before_anything_is_read(name, folder, capsys, monkeypatch):
+    def read(*_: Any, **__: Any) -> None:
+        raise AssertionError("the command has begun its work")
+
+    monkeypatch.setattr(arguments, "open_recording", read)
+    argv = COMMANDS[name].format(source="source.h5", out="missing/a.h5").split()
+    fails(capsys, argv, "missing/a.h5: cannot be written (No such file or directory)")
+
+
 @pytest.mark.parametrize("more", [[], ["--force"]])
 def test_an_output_is_claimed_before_the_work_begins(more, folder, capsys, monkeypatch):
     """A command that begins while another one reads its input does not write the same output."""
