@@ -358,9 +358,9 @@ def guard_outputs(options: dict[str, Any], words: Sequence[str]) -> Iterator[dic
             inputs.append(split_name(camera)[0])
         read = [file for path in inputs for file in (path, *companions(path))]
         with claim_outputs(named) as claims:
-            held = [claim for claim in claims.values() if isinstance(claim, Path)]
+            held = [claim for _, claim in claims if isinstance(claim, Path)]
             check_outputs(named, inputs, force=force, claims=held)
-            for out, claim in claims.items():
+            for out, claim in claims:
                 if isinstance(claim, OSError):  # told before the work begins
                     raise unwritable(out, claim)
             with allow_writing_into_folders(force), running(Command(words, read)):

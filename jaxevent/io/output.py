@@ -192,17 +192,17 @@ def locked(path: Path) -> Iterator[bool]:
 
 
 @contextlib.contextmanager
-def claim_outputs(outputs: Sequence[Path]) -> Iterator[dict[Path, Path | OSError]]:
+def claim_outputs(outputs: Sequence[Path]) -> Iterator[list[tuple[Path, Path | OSError]]]:
     """Claim outputs for a command that writes them later; `check_outputs` refuses them to others.
 
     Args:
         outputs: Files or folders to be written.
 
     Yields:
-        For each output a locked sibling, which is removed after the block, or the error of an
-        output that cannot be written, as in a folder that does not exist.
+        Each output with a locked sibling, which is removed after the block, or with the error of
+        one that cannot be written, as in a folder that does not exist.
     """
-    claims: dict[Path, Path | OSError] = {}
+    claims: list[tuple[Path, Path | OSError]] = []
     with contextlib.ExitStack() as stack:
         for out in (path for path in outputs if path.absolute().name):
             claim = partial_path(out.absolute())
@@ -210,9 +210,9 @@ def claim_outputs(outputs: Sequence[Path]) -> Iterator[dict[Path, Path | OSError
             try:
                 claim.touch(exist_ok=False)
                 stack.enter_context(locked(claim))
-                claims[out] = claim
+                claims.append((out, claim))
             except OSError as error:
-                claims[out] = error
+                claims.append((out, error))
         yield claims
 
 

@@ -139,7 +139,7 @@ def test_prediction_of_a_path():
     t = np.linspace(-0.15, 0.15, 31)
     for tau in (0.0, 0.05, -0.05):
         T, Omega = path.unit_twist(np.clip(t + tau, -0.15, 0.15))
-        heading, turn = predict_path(path, tau, 0.15).twist(t)
+        heading, turn = predict_path(path, tau, 0.15).unit_twist(t)
         np.testing.assert_allclose(turn, Omega, atol=0.03 if tau else 1e-3)
         np.testing.assert_allclose(heading, T, atol=0.03 if tau else 1e-3)
     # The fifth power of what turns by 0.02 rad/s more within the window does not go on beyond.
@@ -147,7 +147,8 @@ def test_prediction_of_a_path():
     steep.O[4] = 1e3
     for tau in (0.1, -0.1):
         change = (
-            predict_path(steep, tau, 0.15).twist(t)[1] - predict_path(path, tau, 0.15).twist(t)[1]
+            predict_path(steep, tau, 0.15).unit_twist(t)[1]
+            - predict_path(path, tau, 0.15).unit_twist(t)[1]
         )
         assert np.abs(change).max() < 0.03
     # Depths are in units of the speed at the reference time.
