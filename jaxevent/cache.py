@@ -86,6 +86,29 @@ def cache_method(method: Callable[..., T], size: int) -> Callable[..., T]:
     return latest
 
 
+class ByValue:
+    """A tree of arrays, as a key of a cache: equal to others if all their numbers are.
+
+    Attributes:
+        tree: The tree.
+    """
+
+    def __init__(self, tree: Any):
+        import jax
+        import numpy as np
+
+        leaves, structure = jax.tree.flatten(tree)
+        arrays = [np.asarray(leaf) for leaf in leaves]
+        self.tree = tree
+        self._key = structure, tuple((a.dtype.str, a.shape, a.tobytes()) for a in arrays)
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ByValue) and self._key == other._key
+
+
 def folder_for_compiled() -> Path | None:
     """Return the user's own folder of compiled programs, or None where there can be none.
 

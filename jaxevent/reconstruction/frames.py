@@ -4,11 +4,11 @@ import dataclasses
 import functools
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.cache import ByValue
 from jaxevent.calibration.clipping import find_clipping
 from jaxevent.camera import Response
 from jaxevent.codegen import njit, read_only
@@ -240,31 +240,33 @@ def _position(breaks: NDArray, i: NDArray, time: NDArray) -> NDArray:
     return np.where(inside, (time - breaks[j]) * interval_rates(breaks)[j], 0)
 
 
-class ResponseTables:
-    """Tables of a camera's response; those of equal responses are evaluated once."""
+def evaluate_response(response: Response, grey: NDArray) -> NDArray:
+    """Evaluate a camera's response.
 
-    def __init__(self, response: Response):
-        self._response = response
-        leaves, tree = jax.tree.flatten(response)
-        arrays = [np.asarray(leaf) for leaf in leaves]
-        double = jnp.result_type(float) == np.float64
-        self._key = tree, double, tuple((a.dtype.str, a.shape, a.tobytes()) for a in arrays)
+    Args:
+        response: The response.
+        grey: Grey values in [0, 1].
 
-    def __hash__(self) -> int:
-        return hash(self._key)
+    Returns:
+        Grey values, intensities and certainties [3, ...].
+    """
+    functions = (lambda grey: grey, response.intensity, response.certainty)
+    return np.stack([evaluate_function(function, grey) for function in functions])
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, ResponseTables) and self._key == other._key
 
-    def evaluate(self, grey: NDArray) -> NDArray:
-        """Return grey values, intensities and certainties [3, ...] of grey values in [0, 1]."""
-        functions = (lambda grey: grey, self._response.intensity, self._response.certainty)
-        return np.stack([evaluate_function(function, grey) for function in functions])
+@functools.lru_cache(maxsize=8)
+def _response_table(response: ByValue, dtype: np.dtype, count: int) -> NDArray:
+    """Evaluate the response at (3, count) evenly spaced grey values, in the precision of JAX.
 
-    @functools.lru_cache(maxsize=8)  # noqa: B019 - equal ones share it, and hold a table
-    def of_levels(self, count: int) -> NDArray:
-        """Evaluate (3, count) evenly spaced grey values."""
-        return read_only(self.evaluate(np.arange(count) / max(count - 1, 1)))
+    Args:
+        response: The response; equal ones share a table.
+        dtype: JAX's own real numbers, with which it is evaluated.
+        count: Number of grey values from 0 to 1.
+
+    Returns:
+        See `evaluate_response`.
+    """
+    return read_only(evaluate_response(response.tree, np.arange(count) / max(count - 1, 1)))
 
 
 class FrameImages:
@@ -272,11 +274,11 @@ class FrameImages:
 
     def __init__(self, recording: Recording, dtype: np.dtype):
         self.recording, self.dtype = recording, dtype
-        self._response, self._gain = ResponseTables(recording.response), recording.gain
+        self._response, self._gain = ByValue(recording.response), recording.gain
 
     def response(self) -> NDArray:
         """Return the intensities of 256 evenly spaced grey values."""
-        return self._response.of_levels(256)[1].astype(self.dtype)
+        return self._table(256)[1]
 
     @functools.cached_property
     def white(self) -> NDArray | None:
@@ -292,11 +294,16 @@ class FrameImages:
         assert self.recording.frames is not None
         kind = self.recording.frames.images.dtype
         levels = 1 + (np.iinfo(kind).max if kind.kind in "iu" else 0)
-        return self._response.of_levels(levels).astype(self.dtype)
+        return self._table(levels)
 
     def values(self, images: NDArray) -> NDArray:
         """Return grey values, intensities and certainties [3, ...] of images in [0, 1]."""
-        return self._response.evaluate(images).astype(self.dtype)
+        return evaluate_response(self._response.tree, images).astype(self.dtype)
+
+    def _table(self, count: int) -> NDArray:
+        """Return `evaluate_response` [3, count] of evenly spaced grey values."""
+        real = np.dtype(jnp.result_type(float))
+        return _response_table(self._response, real, count).astype(self.dtype)
 
     def read(self, frame_range: slice, capacity: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Read a range of frames.

@@ -23,6 +23,7 @@ from jaxevent.blob.lifecycle import init_state
 from jaxevent.blob.params import TrackerParams
 from jaxevent.blob.prepare import Features
 from jaxevent.blob.track import TrackBuffer, positions
+from jaxevent.cache import ByValue
 from jaxevent.codegen import map_ahead
 from jaxevent.codegen.derivative import (
     are_zero_tangents,
@@ -104,32 +105,16 @@ def _variant(features: Features, tangents: bool) -> TrackVariant:
     return TrackVariant(overrides, features.owner is not None, tangents)
 
 
-class _ByValue:
-    """Parameters that are equal to others if all their numbers are."""
-
-    def __init__(self, params: TrackerParams):
-        leaves, tree = jax.tree.flatten(params)
-        arrays = [np.asarray(leaf) for leaf in leaves]
-        self.params = jax.tree.map(jnp.asarray, params)
-        self._key = tree, tuple((a.dtype.str, a.shape, a.tobytes()) for a in arrays)
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _ByValue) and self._key == other._key
-
-
 # Windows of a recording share parameters, one behind the other.
 @functools.lru_cache(maxsize=64)
 def _make_runner(
     filter: Filter,
-    known: _ByValue,
+    known: ByValue,
     detect: bool,
     variant: TrackVariant,
     along: tuple[str, int] | None,
 ) -> KernelRunner:
-    return KernelRunner(filter, known.params, detect=detect, variant=variant, along=along)
+    return KernelRunner(filter, known.tree, detect=detect, variant=variant, along=along)
 
 
 def _evaluate(
@@ -149,7 +134,8 @@ def _evaluate(
     """
     params, *given = jax.tree.unflatten(tree, leaves)
     outliers, features, moments = jax.tree.map(np.asarray, given)
-    known, variant = _ByValue(params), _variant(features, bool(places))
+    known = ByValue(jax.tree.map(jnp.asarray, params))
+    variant = _variant(features, bool(places))
     make = functools.partial(_make_runner, kernel.filter, known, features.detect, variant)
     runners = [make(along) for along in places or (None,)]
     unique, rows = None, slice(0)
