@@ -48,7 +48,7 @@ from jaxevent.tuning import (
     Interval,
     Loss,
     batches_by_params,
-    evaluate_loss,
+    evaluate_at,
     gradient_skill,
     loss_and_grad,
     map_batches,
@@ -281,7 +281,8 @@ class _Sample:
         """
         batches = self.batches if batches is None else batches
         if not isinstance(self.loss, PartwiseLoss):
-            found = map_batches(lambda batch: evaluate_loss(self.loss, params, batch), batches)
+            function = functools.partial(evaluate_at, self.loss, params, self.names)
+            found = map_batches(function, batches)
             pairs = [(np.atleast_1d(value), np.atleast_1d(weight)) for weight, value in found]
         else:
             found = map_batches(lambda batch: _parts(self.loss, params, batch), batches)

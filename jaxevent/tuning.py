@@ -483,6 +483,24 @@ def _compute_losses(loss: Loss, params: Parameters, raw: dict[str, Array], batch
     return jax.vmap(value)(raw)
 
 
+def evaluate_at(loss: Loss, params: Parameters, names: Sequence[str], batch: Any) -> Array:
+    """Compute the loss of a batch by the program that a fit of some numbers runs anyway.
+
+    Args:
+        loss: `loss(params, batch)`, a scalar.
+        params: Parameters of an estimator.
+        names: The numbers that are fitted by gradient.
+        batch: One batch.
+
+    Returns:
+        The loss, (); infinite where a fitted number is out of bounds.
+    """
+    if not names:
+        return evaluate_loss(loss, params, batch)
+    raw = {name: jnp.asarray(np.asarray(params.raw[name])[None]) for name in names}
+    return _compute_losses(loss, params, raw, batch)[0]
+
+
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def loss_and_grad(
     loss: Loss, forward: bool, params: Parameters, raw: dict[str, Array], batch: Any
@@ -667,9 +685,9 @@ class _Loop:
         return validation or fit
 
     def loss(self, params: Any, batches: Sequence[Any]) -> float:
-        return float(
-            _weighted_mean(lambda batch: evaluate_loss(self.function, params, batch), batches)
-        )
+        names = list(self.run.position.raw)
+        function = functools.partial(evaluate_at, self.function, params, names)
+        return float(_weighted_mean(function, batches))
 
     def check_losses(self) -> None:
         """Raise `InputError` unless the losses of the initial parameters are finite."""

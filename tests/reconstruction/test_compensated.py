@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import correlate1d, gaussian_filter, map_coordinates
 from traced import FULL, products
 
 import jaxevent
@@ -892,6 +892,19 @@ def test_prepared_images_are_those_of_the_video():
     np.testing.assert_array_equal(valid.reshape(2, 40, 48), whole.valid)
 
 
+def test_chosen_images_keep_only_their_instants():
+    times = np.array([150_000, 190_000, 212_000, 240_000])
+    _, out = mc.prepare(slide(), times, params())
+    rows = np.array([2, 2])
+    chosen = out.take(rows)
+    assert len(chosen.instants.slot) < len(out.instants.slot)
+    for part in ("points", "slot", "since"):
+        whole, kept = (jax.tree.leaves(getattr(one.instants, part)) for one in (out, chosen))
+        for before, after in zip(whole, kept, strict=True):
+            expected = np.asarray(before)[np.asarray(out.targets.rows)[rows]]
+            np.testing.assert_array_equal(np.asarray(after)[chosen.targets.rows], expected)
+
+
 @pytest.mark.slow
 def test_products_are_of_full_precision():
     """GPUs round the factors of others to 11 bits: choices shift, images by up to 0.05."""
@@ -1065,11 +1078,17 @@ def test_tiny_sensors_and_single_frames(size):
 
 
 @pytest.mark.slow
-def test_blurring_is_scipys():
-    image = np.random.default_rng(5).normal(size=(20, 25)).astype(np.float32)
+@pytest.mark.parametrize("size", [(20, 25), (7, 600)], ids=["one-piece", "pieces"])
+def test_blurring_is_scipys(size):
+    image = np.random.default_rng(5).normal(size=size).astype(np.float32)
     expected = gaussian_filter(image, 1.5, mode="nearest", truncate=3.34)
     blurred = jax.jit(robust_mean.blur_jax, static_argnums=1)(image, 1.5)
     np.testing.assert_allclose(blurred, expected, atol=1e-5)
+    along_x, along_y = warp.gradient_jax(jnp.asarray(image))
+    taps = np.array([1, -8, 0, 8, -1]) / 12
+    for found, axis in ((along_x, 1), (along_y, 0)):
+        expected = correlate1d(image, taps, axis, mode="nearest")
+        np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_variance_features_of_frames_on_one_side():

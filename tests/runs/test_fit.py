@@ -29,6 +29,7 @@ import jaxevent
 import jaxevent.runs.fit
 import jaxevent.tuning
 from jaxevent import cli
+from jaxevent.confidence import confidence_intervals
 from jaxevent.estimator import Estimate
 from jaxevent.methods import METHOD_HOMES, METHODS
 from jaxevent.parameters import Number, Parameters, Positive
@@ -89,6 +90,19 @@ def test_optimise_finds_the_minimum():
     close(searched.params, a=2, b=-1, c=0.3)
     alone = optimise(toy, Toy(), [], [ONE], (), QUICK, {"c": (-2, 2, 5)})
     close(alone.params, a=1, b=0, c=0.3)
+
+
+def test_a_fit_traces_its_loss_twice():
+    """Checks, probes and validation share a program, and gradients are the other."""
+    traced = []
+
+    def counted(params: Toy, batch: Any) -> jax.Array:
+        traced.append(batch)
+        return toy(params, batch)
+
+    fitted = optimise(counted, Toy(), ["a", "b"], [ONE], settings=QUICK)
+    confidence_intervals(counted, Toy(), fitted.params, ["a", "b"], [ONE])
+    assert len(traced) == 2
 
 
 def test_adam_by_hand():

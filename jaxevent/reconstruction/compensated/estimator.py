@@ -50,6 +50,7 @@ from jaxevent.reconstruction.compensated.images import (
 from jaxevent.reconstruction.compensated.instants import (
     merge_instant_times,
     pad_instant_count,
+    pad_with_last,
 )
 from jaxevent.reconstruction.compensated.normal_equations import (
     CostParams,
@@ -128,10 +129,13 @@ class PreparedTargets(ShortRepr):
     samples: int | None = eqx.field(static=True, default=None)
 
     def take(self, rows: NDArray) -> "PreparedTargets":
-        """Choose some of the images, in the order of `rows`."""
+        """Choose some of the images, in the order of `rows`, and the instants that they need."""
         # By NumPy: JAX would compile a program for each shape.
         chosen = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], self.targets)
-        return PreparedTargets(self.instants, chosen, self.noise, self.samples)
+        used, places = np.unique(chosen.rows, return_inverse=True)
+        instants = self.instants.take(used[pad_with_last(len(used), chosen.rows.size)])
+        chosen = chosen._replace(rows=places.reshape(chosen.rows.shape).astype(np.int32))
+        return PreparedTargets(instants, chosen, self.noise, self.samples)
 
 
 @jax.jit

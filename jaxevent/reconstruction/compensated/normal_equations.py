@@ -38,6 +38,7 @@ from jaxevent.reconstruction.compensated.warp import (
     pad_edges,
     path_positions,
     sample_bilinear,
+    sum_images,
 )
 from jaxevent.reconstruction.features import Numeric
 
@@ -772,14 +773,14 @@ def linearise_jax(p: Array, images: MotionImages, cost: CostParams) -> NormalEqu
     W = present[:, None, None] * jnp.where(inside, 1 / (V + cost.floor), OUTSIDE_INFORMATION)
     s = jnp.asarray(times.s)[:, None, None]
     R = W * jnp.exp(-2 * s**2)
-    M = (R * L).sum(0) / R.sum(0)
+    M = sum_images(R * L) / sum_images(R)
     for _ in range(2):
         R = W / (1 + (L - M) ** 2 * W / cost.robust)
-        M = (R * L).sum(0) / R.sum(0)
+        M = sum_images(R * L) / sum_images(R)
     mx, my = gradient_jax(M)
     J = jnp.stack([(gx + mx) / 2 * s, (gy + my) / 2 * s])
     J = jnp.concatenate([J, J * s])
-    J = J - (R * J).sum(1, keepdims=True) / R.sum(0)
+    J = J - jax.vmap(sum_images)(R * J)[:, None] / sum_images(R)
     N = jnp.einsum("khw,akhw,bkhw->hwab", R, J, J)
     b = -jnp.einsum("khw,akhw,khw->hwa", R, J, L - M)
     edge = _average_pixels(jnp.sqrt(mx**2 + my**2 + 1e-20))

@@ -1,9 +1,7 @@
 """Robust mean of images along trajectories: in numba loops, and in JAX for derivatives."""
 
-import functools
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -15,9 +13,11 @@ from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.warp import (
     PathTimes,
     WarpedImages,
+    filter_along,
     gradient_at_pixel,
     gradient_jax,
-    pad_edges,
+    repeat_image,
+    sum_images,
 )
 from jaxevent.reconstruction.features import Numeric
 
@@ -115,15 +115,8 @@ def blur_jax(image: Array, sigma_px: float) -> Array:
     Returns:
         (..., h, w).
     """
-    taps = gaussian_taps(sigma_px)
-    for axis in (image.ndim - 2, image.ndim - 1):
-        size = image.shape[axis]
-        padded = pad_edges(image, axis, len(taps) // 2)
-        moved = [jax.lax.slice_in_dim(padded, i, i + size, axis=axis) for i in range(len(taps))]
-        image = functools.reduce(
-            jnp.add, [float(tap) * one for tap, one in zip(taps, moved, strict=True)]
-        )
-    return image
+    taps = tuple(gaussian_taps(sigma_px).tolist())
+    return filter_along(filter_along(image, -2, taps), -1, taps)
 
 
 def squared_gradient(image: Array) -> Array:
@@ -163,9 +156,9 @@ def robust_mean_jax(
         The mean and its evidence.
     """
     p = params
-    count = len(layout.s)
-    s, present, framed = (v[:, None, None] for v in (layout.s, layout.present, layout.framed))
-    here = (jnp.arange(count) == layout.target)[:, None, None]
+    order, one = jnp.arange(len(layout.s)), jnp.ones(len(layout.s))
+    s, present = (v[:, None, None] for v in (layout.s, layout.present))
+    here, framed, others = order == layout.target, layout.framed, layout.framed * (layout.s != 0)
     eta = (p.information + (1 - p.information) * warped.clear) * present
     base = jnp.where(warped.inside > 0, warped.V + p.floor, OUTSIDE_VARIANCE)
     steepness = squared_gradient(blur_jax(L[layout.target], 1.0))
@@ -173,42 +166,41 @@ def robust_mean_jax(
     visible = jnp.broadcast_to(jnp.exp(-2 * s**2), base.shape)  # near instants begin
     for turn in range(3):
         added = p.sigma_place**2 * steepness + p.sigma_between**2
-        variance = base + jnp.where(here, 0, added)
+        variance = base + repeat_image(added, 1 - here)
         R = eta / variance * visible
-        M = (R * warped.L).sum(0) / R.sum(0)
+        M = sum_images(R * warped.L) / sum_images(R)
         steepness = squared_gradient(M)
-        residual = blur_jax((warped.L - M) ** 2 / variance, RESIDUAL_SIGMA_PX)
+        residual = blur_jax((warped.L - repeat_image(M, one)) ** 2 / variance, RESIDUAL_SIGMA_PX)
         if turn == 0:
-            residual = jnp.where(here, jnp.minimum(residual, 1), residual)
+            residual = jnp.where(here[:, None, None], jnp.minimum(residual, 1), residual)
         visible = 1 / (1 + (residual / p.tolerance) ** 2)
     W = eta / variance
     R = W * visible
-    total = R.sum(0)
-    M = (R * warped.L).sum(0) / total
+    total = sum_images(R)
+    M = sum_images(R * warped.L) / total
     # Of all instants but the plainly hidden ones, whatever the tolerance.
     plain = present / variance / (1 + (residual / SCATTER_TOLERANCE) ** 2)
-    excess = (plain * ((warped.L - M) ** 2 - EXPECTED_SQUARED_RESIDUAL * variance)).sum(0)
-    weight = blur_jax((plain * eta).sum(0), SCATTER_SIGMA_PX)
+    square = (warped.L - repeat_image(M, one)) ** 2
+    excess = sum_images(plain * (square - EXPECTED_SQUARED_RESIDUAL * variance))
+    weight = blur_jax(sum_images(plain * eta), SCATTER_SIGMA_PX)
     scatter = jnp.maximum(blur_jax(excess, SCATTER_SIGMA_PX) / weight, 0)
     W = W * warped.inside
-    near_information = (W * layout.near[:, None, None]).sum(0)
-    near = (W * layout.near[:, None, None] * warped.L).sum(0) / jnp.maximum(near_information, 1e-9)
-    order = jnp.arange(count)
+    near_information, frame_information = sum_images(W, jnp.stack([layout.near, framed]))
+    near = sum_images(W * warped.L, layout.near) / jnp.maximum(near_information, 1e-9)
     low, high = activity_range(layout)
-    between = ((order > low) & (order + 1 < high))[:-1, None, None]
-    share = R / total
-    shares = [(share * framed * side).sum(0) for side in (s < 0, s > 0)]
+    between = ((order > low) & (order + 1 < high))[:-1]
+    sides = jnp.stack([framed * (layout.s < 0), framed * (layout.s > 0), 1 - others])
     return RobustMean(
         M,
         total,
         scatter,
         near,
         near_information,
-        (W * framed).sum(0),
-        ((L[1:] - L[:-1]) ** 2 * between).sum(0),
-        jnp.stack([*shares, (share * (1 - framed * (s != 0))).sum(0)]),
+        frame_information,
+        sum_images((L[1:] - L[:-1]) ** 2, between),
+        sum_images(R, sides) / total,
         jnp.stack([visible[k] * warped.inside[k] for k in (layout.before, layout.after)]),
-        (R * (1 - warped.clear) * warped.V).sum(0) / total,
+        sum_images(R * (1 - warped.clear) * warped.V) / total,
     )
 
 
