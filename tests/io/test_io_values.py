@@ -74,6 +74,14 @@ def test_sizes_are_positive(tmp_path):
     refuses("the sensor has -40x30 pixels", load, path)
 
 
+def test_a_message_names_the_file_once(tmp_path):
+    path, columns = tmp_path / "mine.npz", {name: getattr(EVENTS, name) for name in "txyp"}
+    np.savez(path, **columns, width=40, height=30, frames=np.zeros((2, 20, 40)), frame_t=[1, 2])
+    with pytest.raises(InputError) as caught:
+        load(path)
+    assert str(caught.value).startswith(f"{path}: frames have shape (2, 20, 40)")
+
+
 def test_an_array_of_another_shape_is_named_by_it(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros((5, 50)))
     refuses(r"float64 of shape \(5, 50\)", load, tmp_path / "a.npy", SIZE)
