@@ -475,7 +475,9 @@ def coordinates(
         remedy = "remove the event"
         if value > last and known:
             remedy = f"give the sensor's size or {remedy}"
-            if values.max() < origin + (size[1] if name == "x" else size[0]):
+            if values.max() == last + 1 and values.min() > origin:
+                remedy = f"count {name} from {origin}, {remedy}"
+            elif values.max() < origin + (size[1] if name == "x" else size[0]):
                 remedy = f"swap x and y, {remedy}"
         elif np.isfinite(value) and value != np.rint(value):
             remedy = "round x and y to the pixels of the sensor"

@@ -144,6 +144,7 @@ def test_messages_name_the_argument_and_the_remedy():
         ({"p": (2 * v["p"] - 1).astype(np.uint8)}, "polarity 255; .* p == 1, if 255 is -1"),
         ({"x": v["x"] - 1}, "x = -1; on the 64x48 sensor x is .* 0 to 63, so remove the"),
         ({"x": v["y"], "y": v["x"]}, "y is .* to 47, so swap x and y, give the sensor"),
+        ({"y": v["y"] % 48 + 1}, "y = 48; .* to 47, so count y from 0, give the sensor"),
         ({"y": v["y"] + 60}, "y is a whole number from 0 to 47, so give the sensor"),
         ({"x": np.full(300, np.nan)}, "x = nan; .* so remove the event"),
         ({"x": v["x"][:-5]}, "300, 295, 300 and 300 values; they must be equally long"),
