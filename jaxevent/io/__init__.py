@@ -128,7 +128,7 @@ def load(
     arrays.check_unit(time_unit)
     without_frames, without_events = frames == _NONE, stream == _NONE
     options = ReadOptions(
-        size,
+        None if size is None else (int(size[0]), int(size[1])),
         in_memory,
         progress,
         stream=None if without_events else stream,

@@ -66,6 +66,13 @@ def test_sizes_are_whole_numbers(value, tmp_path):
     refuses("width must be one whole number", load, path)
 
 
+def test_a_size_may_be_an_array(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("0.1 1 2 1\n0.2 3 4 0\n")
+    found = load(path, size=np.array([40, 30]))
+    assert (found.width, found.height) == (40, 30) and type(found.width) is int
+
+
 def test_sizes_are_positive(tmp_path):
     path = tmp_path / "a.h5"
     path.write_bytes(formats.dsec(EVENTS, SIZE))
