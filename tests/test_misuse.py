@@ -103,6 +103,7 @@ def test_a_list_of_lists_of_times_is_refused(bar):
         (lambda r: r[0.1:0.05], "from 100000 to 50000 us ends before it begins"),
         (lambda r: r[9.0:], "no event and no frame from 9000000 us; the recording reaches"),
         (lambda r: jaxevent.load(None), r"the path is None; call jaxevent.load\(path\)"),
+        (lambda r: jaxevent.load("https://a.org/b.h5"), "^https://a.org/b.h5: is an address"),
         (lambda r: jaxevent.load("a.h5", size="60x45"), "size = '60x45' must be two positive"),
         (lambda r: jaxevent.load("a.h5", size=(60.0, 45)), "positive numbers .* whole"),
         (lambda r: jaxevent.save("a.h5", r), r"the path is a Recording; .*save\(recording, path"),

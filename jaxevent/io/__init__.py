@@ -179,6 +179,8 @@ def _as_path(path: Any, call: str) -> Path:
     if not isinstance(path, str | os.PathLike):
         order = {"load": "load(path)", "save": "save(recording, path)"}[call]
         raise InputError(f"the path is {describe_type(path)}; call jaxevent.{order}")
+    if str(path).startswith(("http:/", "https:/")):  # pathlib keeps one slash
+        raise InputError(f"{path}: is an address, not a file; download it first")
     return Path(path)
 
 
