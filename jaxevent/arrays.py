@@ -470,13 +470,19 @@ def coordinates(
         if low or (kind.max > last and len(values) and values.max() > last):
             bad_row = int(np.argmax((values < origin) | (values > last)))
     if bad_row is not None:
-        known = max(size) < MAX_SIDE_PX
+        known, value = max(size) < MAX_SIDE_PX, values[bad_row]
         on = f"on the {size[0]}x{size[1]} sensor " if known else ""
-        remedy = "give the sensor's size or remove the event" if known else "remove the event"
-        if values[bad_row] != np.rint(values[bad_row]):
+        remedy = "remove the event"
+        if value > last and known:
+            remedy = f"give the sensor's size or {remedy}"
+            if values.max() == last + 1 and values.min() > origin:
+                remedy = f"count {name} from {origin}, {remedy}"
+            elif values.max() < origin + (size[1] if name == "x" else size[0]):
+                remedy = f"swap x and y, {remedy}"
+        elif np.isfinite(value) and value != np.rint(value):
             remedy = "round x and y to the pixels of the sensor"
         raise InputError(
-            f"{_intro(source)}event {first_row + bad_row} has {name} = {values[bad_row]:.12g}; "
+            f"{_intro(source)}event {first_row + bad_row} has {name} = {value:.12g}; "
             f"{on}{name} is a whole number from {origin} to {last}, so {remedy}"
         )
     return as_plain(values - origin if origin else values, np.uint16)

@@ -170,6 +170,12 @@ def infer_unit(
     doubt = ""
     if time_unit is not None:
         unit = time_unit
+        if contradiction := _contradiction(numbers, unit, _CONTRADICTION_NATS, usual):
+            doubt = (
+                f"{source}: as {UNIT_NAMES[unit]} events are unusual: {contradiction.text}; if "
+                f"this is right, give time_unit={contradiction.unit!r} or --time-unit "
+                f"{contradiction.unit}"
+            )
     elif stated is not None:
         unit = stated[0]
         notes.append(f"event times are {UNIT_NAMES[unit]}, by {stated[1]}")

@@ -29,6 +29,7 @@ NAMES = {
     "polarity all ON": "lost polarity",
     "20 % hot pixels": "hot pixels",
     "half of the pixels dead": "dead pixels",
+    "a fifth of the columns dead": "dead pixels",
     "rows flipped": "flipped or swapped axes",
     "columns flipped": "flipped or swapped axes",
     "axes swapped": "flipped or swapped axes",

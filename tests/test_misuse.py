@@ -4,12 +4,14 @@ import dataclasses
 import functools
 import inspect
 
+import numpy as np
 import pytest
 from misuse import EQUAL, REFUSED, Case, clean, constructions, estimates, is_right, outcome, run
 
 import jaxevent
 from jaxevent import InputError
 from jaxevent.show.images import video_writer
+from jaxevent.simulate import motion_scene
 
 
 def wrong_of(told: dict[str, str], tried: list[Case]) -> dict[str, str]:
@@ -92,9 +94,16 @@ def test_a_list_of_lists_of_times_is_refused(bar):
     ("call", "said"),
     [
         (lambda r: unchecked(jaxevent.events.crop)(r, 0.0, 0, 10, 10), "^x is 0.0; give a whole"),
+        (lambda r: unchecked(jaxevent.events.voxel_grid)(r, 5.0), "5.0 bins .* whole number"),
+        (lambda r: unchecked(jaxevent.events.downsample)(r, 2.5), "2.5x2.5 .* number from 1 to 48"),
+        (lambda r: unchecked(jaxevent.events.select_polarity)(r, "ON"), "'ON' is not possible"),
+        (lambda r: unchecked(jaxevent.events.select_polarity)(r, 2), "polarity 2 is not possible"),
+        (lambda r: unchecked(motion_scene)("planar", size=(40.5, 30)), "give a whole number"),
+        (lambda r: motion_scene("planar", size=(0, 10)), "0x10 pixels, .* correct its size"),
         (lambda r: r[0.1:0.05], "from 100000 to 50000 us ends before it begins"),
         (lambda r: r[9.0:], "no event and no frame from 9000000 us; the recording reaches"),
         (lambda r: jaxevent.load(None), r"the path is None; call jaxevent.load\(path\)"),
+        (lambda r: jaxevent.load("https://a.org/b.h5"), "^https://a.org/b.h5: is an address"),
         (lambda r: jaxevent.load("a.h5", size="60x45"), "size = '60x45' must be two positive"),
         (lambda r: jaxevent.load("a.h5", size=(60.0, 45)), "positive numbers .* whole"),
         (lambda r: jaxevent.save("a.h5", r), r"the path is a Recording; .*save\(recording, path"),
@@ -106,3 +115,11 @@ def test_a_list_of_lists_of_times_is_refused(bar):
 def test_likely_slips_are_refused(call, said, bar):
     with pytest.raises(InputError, match=said):
         call(bar)
+
+
+@pytest.mark.parametrize(("off", "on"), [(False, True), (0, 1), (-1, 1.0), (np.int8(-1), np.True_)])
+def test_polarities_are_selected_as_any_file_spells_them(bar, off, on):
+    select, count = unchecked(jaxevent.events.select_polarity), int(bar.events.p.sum())
+    assert 0 < count < len(bar.events)
+    assert len(select(bar, on).events) == count
+    assert len(select(bar, off).events) == len(bar.events) - count

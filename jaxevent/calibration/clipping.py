@@ -23,7 +23,7 @@ MAX_BEYOND_RATIO = 0.02
 # that clip as well, and a guess of their excess would spread to the pixels beside them.
 MIN_CLIPPED_SHARE = 0.05
 MAX_CLIPPED_SHARE = 0.9  # of more pixels there is nothing to compare with
-EXCESS_BAND_LOG = 0.35  # ln I, range below white whose density is extrapolated beyond white
+BAND_BELOW_WHITE_LOG_WIDTH = 0.35  # ln I; the density there is extrapolated beyond white
 # Factor on the exponential extrapolation in simulated scenes: the density has modes beyond white.
 EXCESS_FACTOR, EXCESS_BOUNDS = 0.4, (0.1, 2.0)
 
@@ -108,7 +108,7 @@ def _expected_excess(recording: Recording, grey: NDArray, level: float, share: f
     """Return the mean distance of clipped pixels beyond white, ln I.
 
     If the density of ln I falls exponentially, with mean m, from the lower end of the band on, then
-    the band holds exp(EXCESS_BAND_LOG / m) - 1 pixels for each one beyond white.
+    the band holds exp(BAND_BELOW_WHITE_LOG_WIDTH / m) - 1 pixels for each one beyond white.
 
     Args:
         recording: The recording, for its response.
@@ -116,12 +116,11 @@ def _expected_excess(recording: Recording, grey: NDArray, level: float, share: f
         level: Grey value beyond which pixels are clipped.
         share: Share of the pixels beyond it.
 
-
     Returns:
         The excess, ln I, within `EXCESS_BOUNDS`.
     """
     intensity = np.asarray(recording.response.intensity(np.append(grey, level)))
     light, white = intensity[:-1], intensity[-1]
-    band = float(((light < white) & (light >= white * np.exp(-EXCESS_BAND_LOG))).mean())
-    mean = EXCESS_BAND_LOG / np.log1p(band / share) if band else np.inf
+    band = float(((light < white) & (light >= white * np.exp(-BAND_BELOW_WHITE_LOG_WIDTH))).mean())
+    mean = BAND_BELOW_WHITE_LOG_WIDTH / np.log1p(band / share) if band else np.inf
     return float(np.clip(EXCESS_FACTOR * mean, *EXCESS_BOUNDS))

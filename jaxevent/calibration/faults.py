@@ -55,7 +55,7 @@ MAX_REPEATED_SHARE, MIN_NET_EVENTS, MIN_CHANGING = 0.05, 2, 50
 MAX_FLICKER = 0.05  # of ln I, half the lowest thresholds of sensors
 DEAD_PIXELS_REMEDY = (
     "look for pixels that are broken, or masked by the camera or a filter; images of their places "
-    "rest on the frames"
+    "rest on the frames, if there are any"
 )
 
 # Faults of the events alone, whether frames revealed them or not.
@@ -192,8 +192,8 @@ def _check_times(recording: Recording, sample: Sample) -> Iterator[Fault]:
             f"about {100 * lost / (total + lost):.2g} % of the events are missing in {len(gaps)} "
             f"{plural('gap', len(gaps))}, about {most:,} from {begin / 1e6:.6f} to "
             f"{end / 1e6:.6f} s",
-            "record again with a larger buffer or a lower event rate; images between frames around "
-            "the gaps rest on the frames",
+            "record again with a larger buffer or a lower event rate; images around the gaps rest "
+            "on the frames, if there are any",
         )  # fmt: skip
     share = in_bursts / max(total, 1)
     yield Fault(

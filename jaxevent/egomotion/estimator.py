@@ -248,9 +248,10 @@ class MotionEstimator(Estimator[P]):
         others = motion.model.best_method, motion.model.fallback_method
         other = next((f"egomotion.{one}, " for one in others if one not in (None, self.name)), "")
         count = len(motion)
+        lost = "its only estimate is lost" if count == 1 else f"all {count} estimates are lost"
         warnings.warn(
             f"{motion.recording}: {self.name} found no motion, "
-            f"{f'all {count} estimates are lost' if count else 'as there are no events'}; try "
+            f"{lost if count else 'as there are no events'}; try "
             f"{other}another model, or params of other windows",
             LostMotionWarning,
             stacklevel=3,

@@ -31,9 +31,9 @@ from jaxevent.codegen import njit_noalloc
 from jaxevent.egomotion.models import Model
 
 IMAGE_PIXEL_PX = 2.0  # of the images of moved events
-CELL_PX = 24  # of the parts of the image whose errors are independent
-N_BLOCKS = 4  # along each side of the image
-MARGIN_PIXELS = 8  # of an image around the sensor
+CELL_PX = 24  # of the parts of the image whose errors are independent, on all but small sensors
+MARGIN_RATIO = 2 / 3  # of the margin around the sensor to the side of a cell
+N_BLOCKS = 4  # along each side of the image, and least number of cells along the sensor's
 MAX_WINDOW_EVENTS = 6000  # of more, so many evenly
 MIN_WINDOW_EVENTS = 40
 RIVAL_RATIO = 0.2  # of the motion, least distance of the rivals beside it
@@ -92,9 +92,11 @@ class EvidenceTest:
         self.basis = np.asarray(model.basis(xi), np.float64)
         self._sparse_basis = self.basis[::8, ::8].reshape(-1, self.basis.shape[-1])
         self._unit = 1 / np.sqrt((self.basis**2).sum(2).mean((0, 1)))  # of components, for 1 px/s
-        columns, rows = (self.xi.max((0, 1)) // IMAGE_PIXEL_PX).astype(int) + 2 * MARGIN_PIXELS + 2
+        shortest = min(xi.shape[:2]) / N_BLOCKS
+        cell = self._cell = max(int(min(CELL_PX, shortest) / IMAGE_PIXEL_PX), 1)
+        margin = self._margin = round(MARGIN_RATIO * cell)
+        columns, rows = (self.xi.max((0, 1)) // IMAGE_PIXEL_PX).astype(int) + 2 * margin + 2
         self._images = np.zeros((2, rows, columns))
-        cell = int(CELL_PX / IMAGE_PIXEL_PX)
         self._cells = -(-rows // cell), -(-columns // cell)
         row, column = np.indices(self._cells)
         side = np.array([rows, columns]) / N_BLOCKS
@@ -152,7 +154,7 @@ class EvidenceTest:
         votes = np.zeros((len(hypotheses), self._cells[0] * self._cells[1]))
         _accumulate_votes(
             self.xi[y, x], tau[kept], sign, self.basis[y, x], hypotheses * self._unit,
-            self._images, self._cells[1], votes,
+            self._images, self._margin, self._cell, self._cells[1], votes,
         )  # fmt: skip
         D = votes[0] - votes[1:]
         z = D.sum(1) / np.sqrt(np.maximum((D**2).sum(1), 1e-12))
@@ -376,7 +378,7 @@ def report_before_lock(
 
 
 @njit_noalloc
-def _accumulate_votes(at, tau, sign, basis, hypotheses, images, columns, votes):
+def _accumulate_votes(at, tau, sign, basis, hypotheses, images, margin, cell, columns, votes):
     """Add up for each hypothesis the products of the images before and after the middle.
 
     Args:
@@ -386,10 +388,11 @@ def _accumulate_votes(at, tau, sign, basis, hypotheses, images, columns, votes):
         basis: (E, 2, d) flow per unit of each component, px/s.
         hypotheses: (H, d) motions.
         images: (2, height, width) scratch.
+        margin: Pixels of an image around the sensor.
+        cell: Side of a cell, pixels of an image.
         columns: Number of columns of cells.
         votes: (H, cells), changed in place.
     """
-    cell = int(CELL_PX / IMAGE_PIXEL_PX)
     for h in range(len(hypotheses)):
         images[:] = 0
         for e in range(len(tau)):
@@ -397,8 +400,8 @@ def _accumulate_votes(at, tau, sign, basis, hypotheses, images, columns, votes):
             for k in range(hypotheses.shape[1]):
                 u += basis[e, 0, k] * hypotheses[h, k]
                 v += basis[e, 1, k] * hypotheses[h, k]
-            x = (at[e, 0] - u * tau[e]) / IMAGE_PIXEL_PX + MARGIN_PIXELS
-            y = (at[e, 1] - v * tau[e]) / IMAGE_PIXEL_PX + MARGIN_PIXELS
+            x = (at[e, 0] - u * tau[e]) / IMAGE_PIXEL_PX + margin
+            y = (at[e, 1] - v * tau[e]) / IMAGE_PIXEL_PX + margin
             i, j = int(np.floor(x)), int(np.floor(y))
             if i < 0 or j < 0 or i >= images.shape[2] - 1 or j >= images.shape[1] - 1:
                 continue

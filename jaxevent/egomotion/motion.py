@@ -9,7 +9,7 @@ from scipy.ndimage import maximum_filter1d
 
 from jaxevent.camera import PinholeCamera
 from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
-from jaxevent.display import HtmlRepr
+from jaxevent.display import HtmlRepr, format_count
 from jaxevent.egomotion.models import Model, find_model
 from jaxevent.estimator import Estimate
 from jaxevent.recording import Recording, Times, check_times, microseconds
@@ -412,7 +412,7 @@ class MotionEstimate(HtmlRepr):
     def __repr__(self) -> str:
         lost = int((~self.valid).sum())
         model = f"{self.model.name}{' assumed' if self.model_assumed else ''}"
-        return f"MotionEstimate({model}, {len(self)} estimates, {lost} lost)"
+        return f"MotionEstimate({model}, {format_count(len(self), 'estimate')}, {lost} lost)"
 
     def __call__(
         self, times: Times, *, centred: bool | None = None, extrapolate: bool = False

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxevent.arrays import shorten_value
 from jaxevent.codegen import njit
 from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
@@ -38,17 +39,25 @@ def crop_time(part: Part, start: Times | None = None, stop: Times | None = None)
     return part[slice(*(None if us is None else source.index(us) for us in ends))]
 
 
-def select_polarity(part: Part, on: bool = True) -> Part:
+def select_polarity(part: Part, on: bool | int = True) -> Part:
     """Select the events of one polarity.
 
     Args:
         part: Events, or a recording.
-        on: True for ON events, False for OFF events.
+        on: True or 1 for ON events; False, 0 or -1 for OFF events.
 
     Returns:
         The same type.
+
+    Raises:
+        InputError: It is none of these.
     """
-    return select_events(part, lambda events: events.p == on)
+    if np.ndim(on) or on not in (True, False, -1):
+        raise InputError(
+            f"the polarity {shorten_value(on)} is not possible; give True for ON events, False for "
+            "OFF events"
+        )
+    return select_events(part, lambda events: events.p == (on == 1))
 
 
 def is_hot(

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 from numpy.typing import NDArray
 
+from jaxevent.arrays import shorten_value
 from jaxevent.errors import InputError
 from jaxevent.events.blocks import Size, parse_duration, read_blocks, size_of, source_of
 from jaxevent.recording import Events, Recording, Times, microseconds
@@ -233,8 +234,11 @@ def voxel_grid(
     Raises:
         InputError: There is no bin.
     """
-    if bins < 1:
-        raise InputError(f"a voxel grid of {bins} bins is not possible; give 1 or more")
+    if not isinstance(bins, int | np.integer) or bins < 1:
+        raise InputError(
+            f"a voxel grid of {shorten_value(bins)} bins is not possible; give a whole number "
+            "from 1"
+        )
     first, last = _fill_ends(part, start, stop)
 
     def increments(e: Any, xp: Any) -> list[_Increment]:

@@ -149,10 +149,11 @@ def downsample(
         InputError: The factor or the period is not possible.
     """
     across, down = size_of(part, size)
-    if not 1 <= factor <= min(across, down):
+    most = min(across, down)
+    if not isinstance(factor, int | np.integer) or not 1 <= factor <= most:
         raise InputError(
             f"pixels of {factor}x{factor} are not possible on the {across}x{down} sensor; give a "
-            "whole number from 1"
+            f"whole number from 1 to {most}"
         )
     width, height = across // factor, down // factor
     period_us = parse_duration(period, "the period of one event per pixel", least=0)

@@ -128,7 +128,7 @@ def load(
     arrays.check_unit(time_unit)
     without_frames, without_events = frames == _NONE, stream == _NONE
     options = ReadOptions(
-        size,
+        None if size is None else (int(size[0]), int(size[1])),
         in_memory,
         progress,
         stream=None if without_events else stream,
@@ -179,6 +179,8 @@ def _as_path(path: Any, call: str) -> Path:
     if not isinstance(path, str | os.PathLike):
         order = {"load": "load(path)", "save": "save(recording, path)"}[call]
         raise InputError(f"the path is {describe_type(path)}; call jaxevent.{order}")
+    if str(path).startswith(("http:/", "https:/")):  # pathlib keeps one slash
+        raise InputError(f"{path}: is an address, not a file; download it first")
     return Path(path)
 
 

@@ -102,13 +102,16 @@ class ReadOptions:
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Put the path before the message of an `InputError` that does not name it."""
+    """Put the path before the message of an `InputError`, in place of the recording's name."""
     try:
         yield
     except InputError as error:
         if type(error) is not InputError or str(path) in str(error):
             raise
-        raise InputError(f"{path}: {error}") from error
+        message = str(error)
+        for name in (path.name, path.stem):
+            message = message.removeprefix(f"{name}: ")
+        raise InputError(f"{path}: {message}") from error
 
 
 @contextlib.contextmanager

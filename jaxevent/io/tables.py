@@ -171,7 +171,7 @@ def read_npz(path: Path, options: ReadOptions) -> Recording:
             arrays.setdefault("rgb", colours)
     sides = [arrays.pop(name) for name in ("width", "height") if name in arrays]
     stored = whole_size(*sides, source) if options.size is None and len(sides) == 2 else None
-    otherwise = f"{path}: has no width and height and no frames; add them or else"
+    otherwise = f"{path}: has no width and height and no frames"
     size = sensor_size(otherwise, options.size, stored, image_size(images))
     if rows is not None:
         columns = split_rows(rows, order_of(rows[:SAMPLE_EVENTS], size, source))
@@ -379,7 +379,8 @@ def _read_head(file: Any, source: str) -> _Table:
         numbers = [field.replace(decimal, ".") for field in fields]
         if len(fields) != 4 or not all(_is_number(field) for field in numbers):
             raise InputError(
-                f"{source}: the line {line[:60]!r} comes before any names; {_WANTED_LAYOUT}"
+                f"{source}: the line {line[:60]!r} is neither names of the columns t, x, y and p "
+                f"nor four numbers; {_WANTED_LAYOUT}"
             )
         return _Table(start, list("0123"), {}, mark, decimal, size)
     if len(fields) != len(names) or len(set(names)) != len(names):

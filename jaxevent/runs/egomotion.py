@@ -36,6 +36,7 @@ and runs of |estimate - truth|^2, in units of the truth's; of a general motion t
 of angular velocity are added. Random numbers stay the same during the fit.
 
 With "voting" in every window particles start around the true motion, so that no search is fitted.
+Where the motion is lost the mean of the particles that search counts, about as much as no motion.
 The gradient goes through weights, particles and, by the carried score, resampling; ages of
 candidates are held fixed. Any other method that is differentiable, as one of your own, is run
 over every window from its beginning. The numbers of a method that computes on the host are

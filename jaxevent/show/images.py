@@ -5,9 +5,12 @@ display nor pyplot; notebooks show them.
 """
 
 import contextlib
+import errno
 import functools
 import io
 import math
+import os
+import signal
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxevent.errors import InputError, require
-from jaxevent.io.output import complete
+from jaxevent.io.output import complete, unwritable
 from jaxevent.metrics import check_images
 
 # Colours of lines and areas on white, and on a dark page. Any two differ by 30 and more in CIELAB,
@@ -246,7 +249,7 @@ def video_writer(
 
     Raises:
         InputError: The name ends otherwise, the extra "video" is missing, a frame is unfit, there
-            is none, or encoding fails.
+            is none, the file cannot be written, or encoding fails.
     """
     if Path(path).suffix.lower() != ".mp4":
         raise InputError(f"{path}: videos are stored as MP4; end the name in .mp4")
@@ -272,10 +275,14 @@ def video_writer(
                 stderr=log,
             )
 
-        def failure() -> InputError:
+        def failure(status: int) -> InputError:
             log.seek(0)
-            output = " ".join(log.read().decode(errors="replace").split())[-300:]
-            why = f" ({output})" if output else ""
+            output = " ".join(log.read().decode(errors="replace").split())
+            for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+                is_too_large = number == errno.EFBIG and status == -signal.SIGXFSZ
+                if is_too_large or os.strerror(number) in output:
+                    return unwritable(Path(path), OSError(number, os.strerror(number)))
+            why = f" ({output[-300:]})" if output else ""
             return InputError(f"{path}: ffmpeg failed{why}; check the free space and the rate")
 
         def write(image: NDArray) -> None:
@@ -294,8 +301,7 @@ def video_writer(
             try:
                 ffmpeg.stdin.write(np.pad(image, odd, mode="edge").tobytes())
             except BrokenPipeError:
-                ffmpeg.wait()
-                raise failure() from None
+                raise failure(ffmpeg.wait()) from None
 
         try:
             yield write
@@ -303,7 +309,7 @@ def video_writer(
                 raise InputError(f"{path}: a video needs at least one frame; write one")
             ffmpeg.communicate()
             if ffmpeg.returncode:
-                raise failure()
+                raise failure(ffmpeg.returncode)
         finally:
             if ffmpeg is not None:
                 ffmpeg.kill()

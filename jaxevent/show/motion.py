@@ -431,11 +431,9 @@ class WrittenMotion:
         lost = ~self.estimated.valid
         first = np.flatnonzero(~lost)
         if not len(first):
-            lines = [f"{self._format_count()}: the motion was never found"]
-            return [
-                *lines,
-                "another --model or --method, or --params of other windows, may find it",
-            ]
+            advice = "another --model or --method, or --params of other windows, may find it"
+            said = [] if self.motion.warning else [advice]
+            return [f"{self._format_count()}: the motion was never found", *said]
         since = (self.times[first[0]] - self.times[0]) * 1e-6
         later = lost[first[0] :].mean()
         lines = [

@@ -187,6 +187,20 @@ def silence_pixels(recording: Recording, seed: int = 0, *, share: float | int = 
     return _with_events(recording, ~dead[events.y, events.x])
 
 
+def silence_columns(recording: Recording, seed: int = 0, *, share: float | int = 0.2) -> Recording:
+    """Remove all events of the last columns, as where a part of the sensor is masked.
+
+    Args:
+        recording: The recording.
+        seed: Without effect.
+        share: Share of the columns that are silent.
+
+    Returns:
+        The recording without the events of these columns.
+    """
+    return _with_events(recording, recording.events[:].x < round((1 - share) * recording.width))
+
+
 def flip_rows(recording: Recording, seed: int = 0) -> Recording:
     """Flip the events upside down, and leave the frames.
 
@@ -323,6 +337,7 @@ FAULTS: Mapping[str, Callable[[Recording, int], Recording]] = MappingProxyType(
         "polarity all ON": set_polarity_on,
         "20 % hot pixels": add_hot_pixels,
         "half of the pixels dead": silence_pixels,
+        "a fifth of the columns dead": silence_columns,
         "rows flipped": flip_rows,
         "columns flipped": flip_columns,
         "axes swapped": swap_axes,

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from jaxevent.arrays import as_size
 from jaxevent.camera import PinholeCamera
 from jaxevent.deprecated import RenamedAttribute, renamed_names
 from jaxevent.errors import InputError
@@ -660,10 +661,12 @@ def motion_scene(
         The recording, and the camera with the truth.
 
     Raises:
-        InputError: The name or the motion is unknown, or the camera leaves the world.
+        InputError: The name or the motion is unknown, the size is not possible, or the camera
+            leaves the world.
     """
     check_choice(name, "scene", MOTION_SCENES)
     check_choice(motion, "motion", get_args(Change))
+    size = as_size(*size, name)
     rng = np.random.default_rng([seed, MOTION_SCENES.index(name)])
     texture_seed = int(rng.integers(1 << 30))
     if name == "planar":

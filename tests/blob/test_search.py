@@ -59,6 +59,8 @@ def crossed():
 def test_two_that_cross_keep_their_identities(crossed):
     recording, truth, found = crossed
     assert len(found) == 2 and found.summary().startswith("2 targets")
+    twice = dataclasses.replace(found, passes=found.passes * 2)
+    assert twice.summary() == found.summary()
     tracker = blob.constant_velocity
     params = tracker.Params(**found.settings())
     tracks = tracker.estimate(recording, params, found=found, progress=False)

@@ -110,6 +110,15 @@ def test_another_method_is_tried_where_the_usual_one_finds_nothing(folder, capsy
     assert "never found" in capsys.readouterr().out  # a method that was asked for stays
 
 
+def test_other_methods_are_advised_where_no_reason_is_known():
+    times, reason = np.arange(3), "the camera seems to stand still while objects move"
+    for warning in (None, "", reason):
+        motion = dataclasses.replace(MotionEstimate.empty(Planar), warning=warning)
+        found = motion(times, extrapolate=True)
+        lines = pictures.WrittenMotion([], times, found, motion, None, None).summary()
+        assert lines[0].endswith("never found") and (len(lines) == 1) == (warning == reason)
+
+
 def test_frames_that_a_method_does_not_use_are_told(folder):
     recording = jaxevent.load(folder / "planar.h5")
     stamps = np.array([recording.start, recording.stop])

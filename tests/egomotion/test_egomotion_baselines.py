@@ -228,6 +228,13 @@ def test_planes_of_one_direction_are_lost():
     assert np.isfinite(motion.covariance).all()
 
 
+def test_an_event_alone_is_counted_as_one_estimate():
+    recording = swept(np.array([[1.0, 0.0]]), np.array([200.0]))
+    alone = dataclasses.replace(recording, events=recording.events[:1])
+    with pytest.warns(InputWarning, match="planes found no motion, its only estimate is lost; try"):
+        assert "1 estimate, 1 lost" in repr(planes.estimate(alone))
+
+
 def test_frames_find_a_shift():
     pytest.importorskip("cv2", reason="needs the extra 'vision'")
     big = texture(shape=(HEIGHT + 40, WIDTH + 40))

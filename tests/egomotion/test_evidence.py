@@ -55,28 +55,31 @@ def test_motions_along_parallel_edges_are_not_supported():
         assert found is not None and found.rest > 3 and not found.is_supported
 
 
-def test_votes_equal_a_loop():
+@pytest.mark.parametrize(
+    ("size", "cell", "margin"), [((40, 30), 6, 4), ((WIDTH, HEIGHT), 22, 14), ((160, 128), 24, 16)]
+)
+def test_votes_equal_a_loop(size, cell, margin):
     """Sums over pairs of early and late events of overlaps of their bilinear kernels."""
     rng, n = np.random.default_rng(0), 150
     t = np.sort(rng.integers(0, 40_000, n))
-    x, y, p = rng.integers(20, 60, n), rng.integers(20, 60, n), rng.random(n) < 0.5
-    recording = recorded(t, x, y, p)
-    test, U = EvidenceTest(Planar(), pixel_coordinates(WIDTH, HEIGHT, None)[0]), [100.0, -50.0]
+    x, y, p = rng.integers(0, 40, n), rng.integers(0, 30, n), rng.random(n) < 0.5
+    recording = recorded(t, x, y, p, *size)
+    test, U = EvidenceTest(Planar(), pixel_coordinates(*size, None)[0]), [100.0, -50.0]
     found = test.measure(recording.events, 40_000, np.array(U), np.eye(2), 4.0, 0.1)
     length = 4.0 / np.hypot(U[0], U[1])
 
     def votes(U):
-        total = np.zeros((8, 8))
+        total = np.zeros((12, 12))
         tau = t * 1e-6 - 0.04 + length / 2
         use = (np.abs(tau) > length / 6) & (t >= round(40_000 - 1e6 * length))
-        at = (np.stack([x, y], 1) + 0.5 - np.outer(tau, U)) / 2 + 8
+        at = (np.stack([x, y], 1) + 0.5 + margin - np.outer(tau, U)) / 2  # pixels of 2 px
         for i in np.flatnonzero(use & (tau < 0)):
             for j in np.flatnonzero(use & (tau > 0)):
                 if np.abs(at[i] - at[j]).max() < 2:
                     for a in np.ndindex(2, 2):
                         pixel = np.floor(at[i]) + a
                         one, two = (np.maximum(1 - np.abs(at[k] - pixel), 0).prod() for k in (i, j))
-                        row, column = (pixel[::-1] // 12).astype(int)
+                        row, column = (2 * pixel[::-1] // cell).astype(int)
                         total[row, column] += one * two * (1 if p[i] == p[j] else -1)
         return total
 
@@ -239,6 +242,19 @@ def test_events_of_a_part_of_the_image_do_not_tell_a_camera_motion():
     method = HostEstimator("own", Parameters, lambda params, inputs: motion)
     with pytest.warns(InconsistentMotionWarning, match="may stand still"):
         assert not method.estimate(noisy, model="planar").valid.any()
+
+
+def test_a_camera_motion_is_told_on_a_small_sensor_where_the_whole_of_it_moves():
+    flow, motion = (lambda at: np.array([80.0, 20.0])), [80.0, 20.0]
+    recording = moved(flow, 0.3, 60, seed=2, size=(40, 30))
+    estimates = estimate("planar", motion, np.arange(60_000, 260_000, 40_000))
+    told, line = estimates.with_flow_consistency(recording)
+    assert told.valid.all() and not line
+    e = recording.events
+    near = np.hypot(e.x - 20.0, e.y - 15.0) < 7  # 13 % of the sensor
+    part = dataclasses.replace(recording, events=Events(e.t[near], e.x[near], e.y[near], e.p[near]))
+    told, line = estimates.with_flow_consistency(part)
+    assert not told.valid.any() and "may stand still" in line
 
 
 def test_a_heading_that_is_not_observable_is_empty():

@@ -60,6 +60,16 @@ def test_a_window_shorter_than_the_history_is_used_from_its_start():
     assert float(batch.time[0]) < 0.01
 
 
+@pytest.mark.parametrize("compiler", ["numba", "xla"])
+def test_a_lost_motion_costs_about_as_much_as_no_motion(compiler):
+    """A contrast of 50 is never reached, so the motion is lost after the first batches."""
+    params, batch = prepared(compiler=compiler)
+    losing, lost = prepared(compiler=compiler, contrast=50.0)
+    assert float(lost.counted.sum()) == float(batch.counted.sum())
+    assert float(MotionLoss()(params, batch)) < 0.01
+    assert 0.7 < float(MotionLoss()(losing, lost)) < 1.5
+
+
 def test_the_kernel_s_loss_is_that_of_xla():
     (params, by_kernel), (_, by_xla) = prepared(compiler="numba"), prepared(compiler="xla")
     loss = MotionLoss()

@@ -671,7 +671,7 @@ def test_tables_tell_the_size(tmp_path, before):
     [
         ("1,2,3,1\n4,5,6,0\n", "without names could be t x y p or x y t p; .*a line 't x y p'"),
         ("9,2,3,5\n4,5,6,0\n", "without names cannot be t x y p or x y p t or"),
-        ("1,2,3\n4,5,6\n", "'1,2,3' comes before any names; .* line of names such as"),
+        ("1,2,3\n4,5,6\n", "'1,2,3' is neither names of .* nor four numbers; .* line of names"),
         ("t,x,y,p\n", "holds no event"),
         ("t,x,y,p\n1,2,3\n", "does not have the columns t, x, y, p"),
         ("t,x,y,p\n1,2,3,1\n4,5\n", "event 1 has y = nan"),
@@ -680,7 +680,7 @@ def test_tables_tell_the_size(tmp_path, before):
         ("t,x,y,p\n1,2,3,1\n4,5,99,0\n", "event 1 has y = 99; on the 40x30 sensor"),
         ("t,x,y,p\n9,2,3,1\n4,5,6,0\n", "event 1 is at 4 us, earlier"),
         ("t,x,y,p\n1,2,3,yes\n", "event 0 has p = yes"),
-        ("t,t,x,y,p\n1,1,2,3,1\n", "comes before any names"),
+        ("t,t,x,y,p\n1,1,2,3,1\n", "is neither names of"),
         ("t x y p\n" + "1" * 5000, "line of over 4096 bytes"),
     ],
 )

@@ -66,12 +66,27 @@ def test_sizes_are_whole_numbers(value, tmp_path):
     refuses("width must be one whole number", load, path)
 
 
+def test_a_size_may_be_an_array(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("0.1 1 2 1\n0.2 3 4 0\n")
+    found = load(path, size=np.array([40, 30]))
+    assert (found.width, found.height) == (40, 30) and type(found.width) is int
+
+
 def test_sizes_are_positive(tmp_path):
     path = tmp_path / "a.h5"
     path.write_bytes(formats.dsec(EVENTS, SIZE))
     with h5py.File(path, "r+") as file:
         file.attrs["width"], file.attrs["height"] = -40, 30
     refuses("the sensor has -40x30 pixels", load, path)
+
+
+def test_a_message_names_the_file_once(tmp_path):
+    path, columns = tmp_path / "mine.npz", {name: getattr(EVENTS, name) for name in "txyp"}
+    np.savez(path, **columns, width=40, height=30, frames=np.zeros((2, 20, 40)), frame_t=[1, 2])
+    with pytest.raises(InputError) as caught:
+        load(path)
+    assert str(caught.value).startswith(f"{path}: frames have shape (2, 20, 40)")
 
 
 def test_an_array_of_another_shape_is_named_by_it(tmp_path):

@@ -1,4 +1,5 @@
 import re
+import resource
 import subprocess
 import sys
 
@@ -209,6 +210,31 @@ def test_failing_encoder_is_reported_and_leaves_no_file(tmp_path, monkeypatch, f
             for _ in range(frames):
                 write(np.zeros((64, 64), np.uint8))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("limit", ["file", "disk"])
+def test_a_video_that_finds_no_room_says_so_without_the_log_of_its_encoder(
+    limit, tmp_path, monkeypatch
+):
+    path, reason = tmp_path / "video.mp4", "File too large"
+    noise = np.random.default_rng(0).integers(0, 256, (30, 120, 160), np.uint8)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    if limit == "disk":  # the encoder writes to a device that is full
+        program, real = tmp_path / "encoder", imageio_ffmpeg.get_ffmpeg_exe()
+        program.write_text(f'#!/bin/bash\nexec {real} "${{@:1:$#-1}}" /dev/full\n')
+        program.chmod(0o700)
+        monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: str(program))
+        reason = "No space left on device"
+    else:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        with pytest.raises(InputError) as caught, video_writer(path, fps=25) as write:
+            for frame in noise:
+                write(frame)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    wanted = f"{path}: cannot be written ({reason}); choose a writable place with enough room"
+    assert str(caught.value) == wanted and not path.exists()
 
 
 @pytest.mark.parametrize("module, extra", [("imageio_ffmpeg", "video"), ("matplotlib", "plot")])

@@ -110,7 +110,9 @@ class TargetSearchResult:
         if not len(self):
             return text
         size, speed, rate, _ = (self._quantile(values) for values in self._typical_values())
-        windows = [f"{p.selection.scale.window * 1e3:g}" for p in self.passes if p.targets]
+        windows = dict.fromkeys(
+            f"{p.selection.scale.window * 1e3:g}" for p in self.passes if p.targets
+        )
         return (
             f"{text}; size {size:.3g} px, speed {speed:.3g} px/s, {rate:,.0f} events/s each; "
             f"seen in windows of {' and '.join(windows)} ms"
