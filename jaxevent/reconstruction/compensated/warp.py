@@ -113,7 +113,15 @@ def pad_edges(images: Array, axis: int, n_pixels: int) -> Array:
 
 @functools.cache
 def _filter_matrix(size: int, taps: tuple[float, ...]) -> NDArray[np.float64]:
-    """Make the matrix (size, size) that filters along an axis; see `filter_along`."""
+    """Make the matrix that filters along an axis; see `filter_along`.
+
+    Args:
+        size: Length of the axis, px.
+        taps: The filter.
+
+    Returns:
+        (size, size).
+    """
     matrix, rows = np.zeros((size, size)), np.arange(size)
     for offset, tap in enumerate(taps, -(len(taps) // 2)):
         np.add.at(matrix, (rows, np.clip(rows + offset, 0, size - 1)), tap)
