@@ -55,6 +55,8 @@ GATED = {
     "events-only: pixel of 640x480 / of 240x180": ("lower", 0.4),
     "mc: image of 100 Hz video / optical flow": ("lower", 0.3),
     "mc: single image / optical flow": ("lower", 0.3),
+    "mc: loss and 5 gradients / loss": ("lower", 0.4),
+    "mc: loss and 5 gradients / single image": ("lower", 0.4),
     "mc: single image, pixel of 1200x720 / of 240x180": ("lower", 0.4),
     "peak memory of 10 M events, GB": ("lower", 0.25),
     "start: akf, cold / imports": ("lower", 0.4),

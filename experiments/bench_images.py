@@ -593,11 +593,34 @@ def tile(recording: Recording, rows: int, columns: int) -> Recording:
     return Recording("tiles", *size, Events(t, x, y, p), Frames(frames.t, images, frames.exposure))
 
 
+OF_MC = ("c_on", "c_off", "sigma_event", "sigma_pixel", "information")
+
+
+def fit_tasks_of_mc(recording: Recording, times: np.ndarray) -> dict[str, Callable[[], object]]:
+    """Return tasks of a loss of prepared images of `mc`, alone and with its gradient."""
+    start = jaxevent.mc.Params()
+    images = jaxevent.mc.prepare_images(recording, times, start)
+    truth = images(start).mean + 0.1
+
+    def loss(raw, images, truth):
+        image, _, _ = images(start.with_raw(raw))
+        return ((image - truth) ** 2).mean()
+
+    raw = {name: start.raw[name] for name in OF_MC}
+    functions = {"loss": jax.jit(loss), "gradient": jax.jit(jax.value_and_grad(loss))}
+
+    def task(function: Callable) -> Callable[[], object]:
+        return lambda: jax.block_until_ready(function(raw, images, truth))
+
+    return {name: task(function) for name, function in functions.items()}
+
+
 def motion_compensated_bench() -> tuple[dict[str, float], dict[str, float]]:
     """Measure `mc` on the packaged recording: a video, single images, and one of a large sensor.
 
     Beside it runs optical flow between frames, with the video's images. Single images are as far
-    apart as share nothing.
+    apart as share nothing. A fit's loss of those images, whose motion is known, follows, with its
+    gradient.
     """
     recording, params = load(str(RECORDING_FILE)), jaxevent.mc.Params()
     large, second = tile(recording, *TILES), recording.start + np.arange(1_000_000)
@@ -612,14 +635,23 @@ def motion_compensated_bench() -> tuple[dict[str, float], dict[str, float]]:
         "video": make(images, jaxevent.mc, params, recording, video),
         "single": make(images, jaxevent.mc, params, recording, single),
         "large": make(images, jaxevent.mc, params, large, single[1:2]),
+        **fit_tasks_of_mc(recording, single),
     }
-    counts = {"flow": len(video), "video": len(video), "single": len(single), "large": 1}
+    counts = {
+        **{name: len(video) for name in ("flow", "video")},
+        **{name: len(single) for name in ("single", "loss", "gradient")},
+        "large": 1,
+    }
     least = {name: cpu / counts[name] for name, cpu in least_cpu(tasks, 2).items()}
     pixels = TILES[0] * TILES[1]
     return {}, {
         "mc: CPU seconds of an image of 100 Hz video": least["video"],
         "mc: CPU seconds of a single image": least["single"],
         "mc: CPU seconds of a single image, 1200x720": least["large"],
+        "mc: CPU seconds of the loss of an image": least["loss"],
+        "mc: CPU seconds of its loss and gradient": least["gradient"],
+        "mc: loss and 5 gradients / loss": least["gradient"] / least["loss"],
+        "mc: loss and 5 gradients / single image": least["gradient"] / least["single"],
         "mc: image of 100 Hz video / optical flow": least["video"] / least["flow"],
         "mc: single image / optical flow": least["single"] / least["flow"],
         "mc: single image, pixel of 1200x720 / of 240x180": least["large"]
