@@ -48,7 +48,7 @@ from jaxevent.tuning import (
     Interval,
     Loss,
     batches_by_params,
-    evaluate_at,
+    evaluate_fitted_loss,
     gradient_skill,
     loss_and_grad,
     map_batches,
@@ -281,7 +281,7 @@ class _Sample:
         """
         batches = self.batches if batches is None else batches
         if not isinstance(self.loss, PartwiseLoss):
-            function = functools.partial(evaluate_at, self.loss, params, self.names)
+            function = functools.partial(evaluate_fitted_loss, self.loss, params, self.names)
             found = map_batches(function, batches)
             pairs = [(np.atleast_1d(value), np.atleast_1d(weight)) for weight, value in found]
         else:

@@ -483,7 +483,7 @@ def _compute_losses(loss: Loss, params: Parameters, raw: dict[str, Array], batch
     return jax.vmap(value)(raw)
 
 
-def evaluate_at(loss: Loss, params: Parameters, names: Sequence[str], batch: Any) -> Array:
+def evaluate_fitted_loss(loss: Loss, params: Parameters, names: Sequence[str], batch: Any) -> Array:
     """Compute the loss of a batch by the program that a fit of some numbers runs anyway.
 
     Args:
@@ -686,7 +686,7 @@ class _Loop:
 
     def loss(self, params: Any, batches: Sequence[Any]) -> float:
         names = list(self.run.position.raw)
-        function = functools.partial(evaluate_at, self.function, params, names)
+        function = functools.partial(evaluate_fitted_loss, self.function, params, names)
         return float(_weighted_mean(function, batches))
 
     def check_losses(self) -> None:

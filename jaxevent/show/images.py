@@ -24,6 +24,7 @@ from jaxevent.errors import InputError, require
 from jaxevent.io.output import complete, unwritable
 from jaxevent.metrics import check_images
 
+FILE_SIZE_SIGNAL = getattr(signal, "SIGXFSZ", None)  # ends a program whose file is too large
 # Colours of lines and areas on white, and on a dark page. Any two differ by 30 and more in CIELAB,
 # also to eyes that lack one kind of cone, and have a contrast of 3 or more to the page.
 COLOURS = ("#0847d0", "#f06900", "#09a771", "#c364b7", "#6e2800", "#1d2329")
@@ -279,7 +280,7 @@ def video_writer(
             log.seek(0)
             output = " ".join(log.read().decode(errors="replace").split())
             for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-                is_too_large = number == errno.EFBIG and status == -signal.SIGXFSZ
+                is_too_large = number == errno.EFBIG and -status == FILE_SIZE_SIGNAL
                 if is_too_large or os.strerror(number) in output:
                     return unwritable(Path(path), OSError(number, os.strerror(number)))
             why = f" ({output[-300:]})" if output else ""
