@@ -16,7 +16,6 @@ from jaxevent.reconstruction.compensated.warp import (
     filter_along,
     gradient_at_pixel,
     gradient_jax,
-    repeat_image,
     sum_images,
 )
 from jaxevent.reconstruction.features import Numeric
@@ -156,9 +155,9 @@ def robust_mean_jax(
         The mean and its evidence.
     """
     p = params
-    order, one = jnp.arange(len(layout.s)), jnp.ones(len(layout.s))
+    order = jnp.arange(len(layout.s))
     s, present = (v[:, None, None] for v in (layout.s, layout.present))
-    here, framed, others = order == layout.target, layout.framed, layout.framed * (layout.s != 0)
+    here, framed = (order == layout.target)[:, None, None], layout.framed
     eta = (p.information + (1 - p.information) * warped.clear) * present
     base = jnp.where(warped.inside > 0, warped.V + p.floor, OUTSIDE_VARIANCE)
     steepness = squared_gradient(blur_jax(L[layout.target], 1.0))
@@ -166,13 +165,13 @@ def robust_mean_jax(
     visible = jnp.broadcast_to(jnp.exp(-2 * s**2), base.shape)  # near instants begin
     for turn in range(3):
         added = p.sigma_place**2 * steepness + p.sigma_between**2
-        variance = base + repeat_image(added, 1 - here)
+        variance = base + jnp.where(here, 0, added)
         R = eta / variance * visible
         M = sum_images(R * warped.L) / sum_images(R)
         steepness = squared_gradient(M)
-        residual = blur_jax((warped.L - repeat_image(M, one)) ** 2 / variance, RESIDUAL_SIGMA_PX)
+        residual = blur_jax((warped.L - M) ** 2 / variance, RESIDUAL_SIGMA_PX)
         if turn == 0:
-            residual = jnp.where(here[:, None, None], jnp.minimum(residual, 1), residual)
+            residual = jnp.where(here, jnp.minimum(residual, 1), residual)
         visible = 1 / (1 + (residual / p.tolerance) ** 2)
     W = eta / variance
     R = W * visible
@@ -180,7 +179,7 @@ def robust_mean_jax(
     M = sum_images(R * warped.L) / total
     # Of all instants but the plainly hidden ones, whatever the tolerance.
     plain = present / variance / (1 + (residual / SCATTER_TOLERANCE) ** 2)
-    square = (warped.L - repeat_image(M, one)) ** 2
+    square = (warped.L - M) ** 2
     excess = sum_images(plain * (square - EXPECTED_SQUARED_RESIDUAL * variance))
     weight = blur_jax(sum_images(plain * eta), SCATTER_SIGMA_PX)
     scatter = jnp.maximum(blur_jax(excess, SCATTER_SIGMA_PX) / weight, 0)
@@ -189,7 +188,7 @@ def robust_mean_jax(
     near = sum_images(W * warped.L, layout.near) / jnp.maximum(near_information, 1e-9)
     low, high = activity_range(layout)
     between = ((order > low) & (order + 1 < high))[:-1]
-    sides = jnp.stack([framed * (layout.s < 0), framed * (layout.s > 0), 1 - others])
+    before, after = framed * (layout.s < 0), framed * (layout.s > 0)
     return RobustMean(
         M,
         total,
@@ -198,7 +197,7 @@ def robust_mean_jax(
         near_information,
         frame_information,
         sum_images((L[1:] - L[:-1]) ** 2, between),
-        sum_images(R, sides) / total,
+        sum_images(R, jnp.stack([before, after, 1 - before - after])) / total,
         jnp.stack([visible[k] * warped.inside[k] for k in (layout.before, layout.after)]),
         sum_images(R * (1 - warped.clear) * warped.V) / total,
     )

@@ -169,20 +169,6 @@ def sum_images(images: Array, weights: Numeric | None = None) -> Array:
     return jnp.tensordot(weights.astype(images.dtype), images, 1)
 
 
-@full_precision
-def repeat_image(image: Array, weights: Array) -> Array:
-    """Multiply an image (h, w) by each of the weights (K,); its derivative is `sum_images`.
-
-    Args:
-        image: (h, w).
-        weights: (K,).
-
-    Returns:
-        (K, h, w).
-    """
-    return jnp.tensordot(weights.astype(image.dtype), image, 0)
-
-
 def gradient_jax(images: Array) -> tuple[Array, Array]:
     """Return the gradients of images (..., h, w) along x and y, as `gradient_at_pixel` does."""
     along_x, along_y = (filter_along(images, axis, GRADIENT_TAPS) for axis in (-1, -2))
