@@ -11,7 +11,9 @@ from jaxevent.methods import find
 from jaxevent.reconstruction.compensated.event_noise import (
     EventNoise,
     IntervalNoise,
+    NoiseParams,
     inflate_variances,
+    measure_noise,
 )
 from jaxevent.reconstruction.compensated.images import InstantImages
 from jaxevent.reconstruction.compensated.normal_equations import CostParams, PackedImages
@@ -175,7 +177,7 @@ def test_images_of_faulty_events_are_no_worse_than_of_frames(fault):
 def test_prepared_images_of_faulty_events_are_those_of_the_video():
     t, video = np.array([190_000]), faulty_video("rows flipped")
     features, out = mc.prepare(video.recording, t, VALUES)
-    assert out.noise.factor.max() > 10
+    assert video.trajectories.event_noise(2).factor.max() > 10
     found = jax.jit(lambda p: mc.read(p, mc.run(p, features)[0], out))(VALUES)
     whole = video(t)
     np.testing.assert_allclose(found.mean.reshape(1, 40, 48), whole.mean, atol=2e-3)
@@ -195,3 +197,53 @@ def test_frames_on_the_events_clock_count_before_the_first_event():
     recording, _ = drawn()
     images = InstantImages(recording, PARAMS.replace(clock_offset=-0.2), 1 << 14)
     assert images(FRAMES - 200_000)[2].all()
+
+
+def test_noise_has_the_derivatives_of_its_differences():
+    recording, change = drawn()
+    error = 0.5 * np.random.default_rng(2).normal(size=change.shape)
+    images = TrueImages(change + error, 1e-3)
+    frames, noise = images(FRAMES[:2]), EventNoise(recording, PARAMS, images, FRAMES)
+    names = ("c_on", "c_off", "sigma_event")
+    events = noise.events(np.array([0]), FRAMES)
+    np.testing.assert_array_equal(events.ends, [[0, 1]])
+
+    def measure(values):
+        params = PARAMS.replace(**dict(zip(names, values, strict=True)))
+        return measure_noise(
+            NoiseParams.of(params, jax.numpy.asarray),
+            jax.tree.map(lambda image: image[None], frames),
+            events.counts,
+            events.seconds,
+        )
+
+    values = [getattr(PARAMS, name).item() for name in names]
+    found = measure(jax.numpy.asarray(values))
+    for one, other in zip(found, noise(0), strict=True):
+        np.testing.assert_allclose(np.asarray(one)[0], other, rtol=1e-3, atol=1e-4)
+    assert 1.5 < np.median(found.factor) < 100
+    slopes = jax.jacfwd(lambda v: measure(v).excess.mean())(jax.numpy.asarray(values))
+    for k, name in enumerate(names):
+        ends = [
+            EventNoise(recording, PARAMS.replace(**{name: v}), images, FRAMES)(0).excess.mean()
+            for v in (values[k] * 1.01, values[k] * 0.99)
+        ]
+        slope = (ends[0] - ends[1]) / (0.02 * values[k])
+        np.testing.assert_allclose(slopes[k], slope, rtol=0.02)
+
+
+@pytest.mark.slow
+def test_prepared_images_measure_the_noise_anew():
+    """With other thresholds than those of `prepare` the noise is theirs, as a fit needs."""
+    t, other = np.array([175_000]), VALUES.replace(c_on=0.6, c_off=0.6)
+    read = jax.jit(lambda p, features, out: mc.read(p, mc.run(p, features)[0], out))
+    prepared = mc.prepare(sound(), t, VALUES)
+    before, found, anew = (
+        np.median(np.log(read(values, *one).covariance))
+        for values, one in (
+            (VALUES, prepared),
+            (other, prepared),
+            (other, mc.prepare(sound(), t, other)),
+        )
+    )
+    assert abs(found - anew) < 0.1 * (anew - before)

@@ -24,8 +24,10 @@ from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.precision import to_jax, with_own_settings
 from jaxevent.reconstruction.compensated.event_noise import (
-    IntervalNoise,
+    IntervalEvents,
+    NoiseParams,
     inflate_variances,
+    measure_noise,
 )
 from jaxevent.reconstruction.compensated.exposures import (
     AdjacentExposures,
@@ -99,7 +101,8 @@ class PreparedTarget(NamedTuple):
     Attributes:
         rows: Indices of its instants among all.
         layout: Layout of its instants.
-        noise_rows: Rows of `PreparedTargets.noise` of its instants.
+        events: Events of the intervals that its instants are in; `ends` are rows of its instants.
+        noise_rows: Index of each instant's interval among these.
         noise_shape: See `event_noise.IntervalPositions.shape`.
         p: Trajectories of nodes, px.
         path_index: Flat index of the pixel whose path each pixel takes.
@@ -110,6 +113,7 @@ class PreparedTarget(NamedTuple):
 
     rows: Int[Numeric, "*times k"]
     layout: InstantLayout
+    events: IntervalEvents
     noise_rows: Int[Numeric, "*times k"]
     noise_shape: Float[Numeric, "*times k"]
     p: Float[Numeric, "*times rows columns 4"]
@@ -124,7 +128,6 @@ class PreparedTargets(ShortRepr):
 
     instants: ReadOut  # all instants of all targets, sorted
     targets: PreparedTarget  # stacked
-    noise: IntervalNoise  # of the intervals between frames at hand; constant, as motion is
     # Of exposures; None: images are not fitted to them.
     samples: int | None = eqx.field(static=True, default=None)
 
@@ -135,7 +138,7 @@ class PreparedTargets(ShortRepr):
         used, places = np.unique(chosen.rows, return_inverse=True)
         instants = self.instants.take(used[pad_with_last(len(used), chosen.rows.size)])
         chosen = chosen._replace(rows=places.reshape(chosen.rows.shape).astype(np.int32))
-        return PreparedTargets(instants, chosen, self.noise, self.samples)
+        return PreparedTargets(instants, chosen, self.samples)
 
 
 @jax.jit
@@ -416,21 +419,24 @@ class MotionCompensation(ImageEstimator[Params]):
         size = (recording.height, recording.width)
         own = np.arange(recording.height * recording.width, dtype=np.int32).reshape(size)
         noise = trajectories.event_noise
-        intervals = np.unique(noise.locate(every).interval)
+        n_intervals = max(len(noise.locate(one.t).between_frames()) for one in chosen)
         targets = []
         for t in wanted.tolist():
             target = trajectories(t)
             one, rows = target.instants, np.zeros(count, np.int32)
             rows[: len(one)] = np.searchsorted(every, one.t)
-            places, shape = noise.locate(every[rows])
-            noise_rows = np.searchsorted(intervals, places).astype(np.int32)
+            positions = noise.locate(every[rows])
+            intervals = noise.locate(one.t).between_frames()
+            intervals = np.resize(intervals, n_intervals)
+            noise_rows = (positions.interval[:, None] == intervals).argmax(1).astype(np.int32)
             path_index = own if target.path_index is None else target.path_index
             targets.append(
                 PreparedTarget(
                     rows,
                     make_layout(one, target.clear, count),
+                    noise.events(intervals, one.t),
                     noise_rows,
-                    shape,
+                    positions.shape,
                     target.p,
                     path_index,
                     trajectories.exposures(t, one),
@@ -442,9 +448,9 @@ class MotionCompensation(ImageEstimator[Params]):
         def stack(*leaves: Any) -> NDArray:
             return np.stack(leaves)
 
-        found = jax.tree.map(stack, *(noise(k) for k in intervals.tolist()))
-        stacked = jax.tree.map(stack, *targets)
-        out = PreparedTargets(instants, stacked, found, trajectories.exposures.samples)
+        out = PreparedTargets(
+            instants, jax.tree.map(stack, *targets), trajectories.exposures.samples
+        )
         return features, jax.device_put(out)
 
     def run(self, params: Params, features: Features, state: Any = None) -> tuple[Any, Any]:
@@ -474,27 +480,34 @@ class MotionCompensation(ImageEstimator[Params]):
         L, V, clear = instant_smoother.read(params, trajectory, out.instants)
         frames = jax.tree.map(jnp.asarray, trajectory.frames)
         L, V, clear = (v.reshape(len(v), -1, frames.width) for v in (L, V, clear.astype(L.dtype)))
+        noise_params = NoiseParams.of(params, jnp.asarray)
 
         @jax.checkpoint
         def one(target: PreparedTarget) -> tuple[Array, Array]:
-            rows, layout, noise_rows, shape, p, path_index, exposures, steady, brightness = target
+            rows, layout, events = target.rows, target.layout, target.events
+            shape, steady = target.noise_shape, target.steady
             smooth = (1 - steady) * gaussian_blur(L[rows])
-            noise = jax.tree.map(lambda values: values[noise_rows], out.noise)
+            at_frames = tuple(values[rows[events.ends]] for values in (L, V, clear))
+            noise = measure_noise(noise_params, at_frames, events.counts, events.seconds)
+            noise = jax.tree.map(lambda values: values[target.noise_rows], noise)
             variances = inflate_variances(V[rows], noise, shape)
             images = (L[rows] - smooth, variances, clear[rows])
             at_frame = shape[layout.target] == 0
             factor = jnp.where(at_frame, 1, noise.factor[layout.target])
+            p = target.p
             if self.through_motion:
-                p = self._with_derivative(params, images, layout, p)
-            paths = interpolate_paths_jax(p, *path_index.shape).reshape(-1, 4)[path_index]
+                p = self._with_derivative(params, images, layout, target.p)
+            paths = interpolate_paths_jax(p, *target.path_index.shape)
+            paths = paths.reshape(-1, 4)[target.path_index]
             warped = warp_images_jax(*images, layout.path_times, paths)
             reach = squared_reach(paths, layout.common)
             fused = fuse(params, *images[:2], warped, layout, reach, noise=factor)
             weight = after_weight(layout)
-            base, variance = smooth_part_at_target(smooth, layout, weight, paths, brightness)
+            base, variance = smooth_part_at_target(smooth, layout, weight, paths, target.brightness)
             base, added = (1 - steady) * base, (1 - steady) * variance
             fused = dataclasses.replace(fused, L=fused.L + base, P=fused.P + added)
             if out.samples is not None:
+                exposures = target.exposures
                 at = exposures.frame
                 adjacent = AdjacentFrames(
                     frames.grey[at],

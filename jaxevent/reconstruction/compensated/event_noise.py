@@ -21,7 +21,8 @@ The trust in the events of an interval is the mean of 1 / factor, weighted by <v
 """
 
 import collections
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -47,11 +48,39 @@ class IntervalNoise(NamedTuple):
     trust: Float[Numeric, "*intervals"]  # 0..1
 
 
+class NoiseParams(NamedTuple):
+    """Parameters of `mc` that the expected noise of events depends on, each ()."""
+
+    c_on: Numeric | float
+    c_off: Numeric | float
+    sigma_event: Numeric | float
+    sigma_bg: Numeric | float
+    share: Numeric | float
+
+    @classmethod
+    def of(cls, params: Params, convert: Callable[[Any], Any] = float) -> "NoiseParams":
+        """Take the parameters of the noise from those of `mc`, converted."""
+        return cls(*(convert(getattr(params, name)) for name in cls._fields))
+
+
+class IntervalEvents(NamedTuple):
+    """Events of intervals between frames, from which their noise is measured."""
+
+    ends: Int[Numeric, "*intervals 2"]  # rows, among images, of the frames before and after
+    counts: Float[Numeric, "*intervals 2 h w"]  # ON and OFF events
+    seconds: Float[Numeric, "*intervals"]
+
+
 class IntervalPositions(NamedTuple):
     """Positions of instants in the intervals between frames."""
 
     interval: Int[Numeric, " k"]  # index of the frame before, of the nearest interval beyond
     shape: Float[Numeric, " k"]  # w (1 - w); 0 at frames
+
+    def between_frames(self) -> NDArray[np.int64]:
+        """Return the intervals that hold instants other than frames, at least one."""
+        inside = np.asarray(self.interval)[np.asarray(self.shape) > 0]
+        return np.unique(inside if len(inside) else self.interval[:1])
 
 
 def inflate_variances(V: Numeric, noise: IntervalNoise, shape: Numeric) -> Numeric:
@@ -67,6 +96,35 @@ def inflate_variances(V: Numeric, noise: IntervalNoise, shape: Numeric) -> Numer
     """
     shape = shape[:, None, None]
     return V * jnp.where(shape > 0, noise.factor, 1) + noise.excess * shape
+
+
+def measure_noise(
+    params: NoiseParams, images: tuple[Any, Any, Any], counts: Any, seconds: Any
+) -> IntervalNoise:
+    """Measure the noise of the events between two frames; differentiable.
+
+    Args:
+        params: Parameters.
+        images: L, V and clear at both frames, each (..., 2, h, w), of NumPy or JAX.
+        counts: (..., 2, h, w) ON and OFF events between the frames.
+        seconds: (...) time between the frames, s.
+
+    Returns:
+        The noise, of float32 for NumPy.
+    """
+    L, V, clear = images
+    counts = _share_out(counts, params.share)
+    up, down = params.c_on * counts[..., 0, :, :], params.c_off * counts[..., 1, :, :]
+    steps = params.sigma_event**2 * (params.c_on * up + params.c_off * down)
+    drift = (params.sigma_bg**2 * seconds)[..., None, None]
+    both = clear[..., 0, :, :] * clear[..., 1, :, :]
+    change = L[..., 1, :, :] - L[..., 0, :, :]
+    e = both * (change - (up - down)).astype(L.dtype)
+    e = e - both * gaussian_blur(e) / gaussian_blur(both).clip(1e-6)
+    v = gaussian_blur(both * (steps + drift + V.sum(-3)).astype(L.dtype), REGION_SIGMA_PX)
+    factor = (gaussian_blur(e * e, REGION_SIGMA_PX) / v.clip(1e-9)).clip(1) ** 2
+    trust = (v / factor).sum((-2, -1)) / v.sum((-2, -1)).clip(1e-12)
+    return IntervalNoise(factor, (factor - 1) * v, trust)
 
 
 class EventNoise:
@@ -132,37 +190,50 @@ class EventNoise:
         size = self._images.image_shape
         if len(self._frames) < 2:
             return IntervalNoise(np.ones(size, np.float32), np.zeros(size, np.float32), 1.0)
-        params, begin, end = self._params, *self._frames[interval : interval + 2].tolist()
-        L, V, clear = self._images(np.array([begin, end]))
-        counts = count_polarities(self._recording, begin, end, 1e6 * float(params.rho_ref))
+        begin, end = self._frames[interval : interval + 2].tolist()
+        images = self._images(np.array([begin, end]))
+        params, counts = NoiseParams.of(self._params), self._count_events(interval)
+        return measure_noise(params, images, counts, np.float64((end - begin) * 1e-6))
+
+    def _count_events(self, interval: int) -> NDArray[np.float64]:
+        """Count the ON and OFF events between two frames, (2, h, w), in common thresholds."""
+        rho_us = 1e6 * float(self._params.rho_ref)
+        begin, end = self._frames[interval : interval + 2].tolist()
+        counts = count_polarities(self._recording, begin, end, rho_us)
         if self._images.factors is not None:
             counts = counts * self._images.factors
-        on, off = _share_out(counts.reshape(2, *size), float(params.share))
-        c_on, c_off = float(params.c_on), float(params.c_off)
-        up, down = c_on * on, c_off * off
-        steps = float(params.sigma_event) ** 2 * (c_on * up + c_off * down)
-        drift = float(params.sigma_bg) ** 2 * (end - begin) * 1e-6
-        both = clear[0] * clear[1]
-        e = both * (L[1] - L[0] - (up - down)).astype(np.float32)
-        e -= both * gaussian_blur(e) / np.maximum(gaussian_blur(both), 1e-6)
-        expected = both * np.asarray(steps + drift + V.sum(0), np.float32)
-        found, v = gaussian_blur(np.stack([e * e, expected]), REGION_SIGMA_PX)
-        factor = np.maximum(found / np.maximum(v, 1e-9), 1) ** 2
-        trust = float((v / factor).sum() / max(v.sum(), 1e-12))
-        return IntervalNoise(factor, (factor - 1) * v, trust)
+        return counts.reshape(2, *self._images.image_shape)
+
+    def events(self, intervals: NDArray[np.int64], times: NDArray[np.int64]) -> IntervalEvents:
+        """Return what `measure_noise` needs of some intervals beside images.
+
+        Args:
+            intervals: (n,) indices of the frames before.
+            times: (images,) sorted times of images, us; those of frames at either end are there.
+
+        Returns:
+            The events; of a recording with a single frame none, and that frame at both ends.
+        """
+        ends = self._frames[np.minimum(intervals[:, None] + np.arange(2), len(self._frames) - 1)]
+        counts = np.zeros((len(intervals), 2, *self._images.image_shape), np.float32)
+        if len(self._frames) > 1:
+            counts[:] = [self._count_events(k) for k in intervals.tolist()]
+        seconds = (np.diff(ends)[:, 0] * 1e-6).astype(np.float32)
+        return IntervalEvents(np.searchsorted(times, ends).astype(np.int32), counts, seconds)
 
 
-def _share_out(counts: NDArray[np.floating], share: float) -> NDArray[np.floating]:
+def _share_out(counts: Any, share: Numeric | float) -> Any:
     """Share counts of events out between pixels and their 8 neighbours.
 
     Args:
-        counts: (2, h, w) ON and OFF events.
+        counts: (..., h, w) events, of NumPy or JAX.
         share: Fraction of each event that goes to the neighbours, 0..1.
 
     Returns:
-        (2, h, w); what would go beyond the border is lost.
+        (..., h, w); what would go beyond the border is lost.
     """
-    padded = np.pad(counts, [(0, 0), (1, 1), (1, 1)])
-    rows = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
-    around = rows[:, :, :-2] + rows[:, :, 1:-1] + rows[:, :, 2:] - counts
+    widths = [(0, 0)] * (counts.ndim - 2) + [(1, 1), (1, 1)]
+    padded = counts.__array_namespace__().pad(counts, widths)
+    rows = padded[..., :-2, :] + padded[..., 1:-1, :] + padded[..., 2:, :]
+    around = rows[..., :-2] + rows[..., 1:-1] + rows[..., 2:] - counts
     return (1 - share) * counts + share * around / 8
