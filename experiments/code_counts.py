@@ -89,7 +89,6 @@ GLOSSARY = {
     "agree": "robust_mean", "agree_purely": "robust_mean_jax", "Agreement": "RobustMean",
     "shown": "visibility", "compare": "fusion_features", "Comparison": "FusionFeatures",
     "decide": "fuse_candidates", "whose": "path_index", "Course": "MotionClock",
-    "imbalance": "normal_equation_residual", "depending": "implicit_trajectories",
     "stand_out": "subtract_local_mean",
     "Divided": "PartitionedRecording", "ImageRoom": "BufferPool", "room": "scratch",
     "Motion": "MotionEstimate", "decided": "is_observable", "Layers": "FlowConsistency",

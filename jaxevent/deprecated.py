@@ -88,6 +88,7 @@ RENAMED: dict[str, str] = {
     "jaxevent.parameters.phrase": "jaxevent.parameters.describe_value_type",
     "jaxevent.reconstruction.compensated.MotionCompensated": "jaxevent.reconstruction.compensated.MotionCompensation",
     "jaxevent.reconstruction.compensated.estimator.MotionCompensated": "jaxevent.reconstruction.compensated.estimator.MotionCompensation",
+    "jaxevent.reconstruction.compensated.mc_through_motion": "jaxevent.reconstruction.compensated.mc",
     "jaxevent.reconstruction.filtering.Observer": "jaxevent.reconstruction.filtering.FrameModel",
     "jaxevent.reconstruction.filtering.State": "jaxevent.reconstruction.filtering.PixelState",
     "jaxevent.register.Warped": "jaxevent.register.ResampledImages",

@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -209,6 +209,17 @@ class ImageEstimator(Estimator[P]):
             f"the method {self.name!r} takes whole recordings; use akf, cf or high-pass for events "
             "that are still to come"
         )
+
+    def preparation_key(self, params: P) -> Hashable:
+        """Return the parameters that preparation depends on: images are prepared again with others.
+
+        Args:
+            params: Parameters.
+
+        Returns:
+            Their values; without the numbers that a fit follows by gradient.
+        """
+        return EventTiming.of(params)
 
     def prepare_images(
         self,

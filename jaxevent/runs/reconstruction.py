@@ -25,7 +25,6 @@ from jaxevent.processes import REMOTE_BATCH
 from jaxevent.reconstruction.augment import FrameParams, calibrated_values
 from jaxevent.reconstruction.estimator import ImageEstimator, PreparedImages
 from jaxevent.reconstruction.features import Numeric
-from jaxevent.reconstruction.frames import EventTiming
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.config import (
     NAME_CHECK,
@@ -299,8 +298,8 @@ class Problem:
     `processes.REMOTE_BATCH`.
 
     They are prepared when first asked for and again for params that differ in what preparation
-    fixes (`clock.EventTiming`). `weights` are those of dark, well exposed and bright pixels of HDR
-    references, told apart by their `clip`; omitted, 1.
+    fixes (`ImageEstimator.preparation_key`). `weights` are those of dark, well exposed and bright
+    pixels of HDR references, told apart by their `clip`; omitted, 1.
     """
 
     def __init__(
@@ -320,7 +319,7 @@ class Problem:
         self._rooms = [
             max([int((part.split == s).sum()) for part, _ in self._jobs], default=0) for s in (0, 1)
         ]
-        self._last = LastBatches(EventTiming.of, self._prepare)
+        self._last = LastBatches(objective.method.preparation_key, self._prepare)
 
     def __call__(self, params: FrameParams) -> Batches:
         """Return the batches to fit to, and those to validate on."""
@@ -492,7 +491,7 @@ class EventGoal(Goal):
                             batches[s].append(self._batch(recording, times, params))
             return batches
 
-        return LastBatches(EventTiming.of, prepare)
+        return LastBatches(self.method.preparation_key, prepare)
 
     def _batch(
         self, recording: Recording, times: NDArray[np.int64], params: FrameParams

@@ -476,6 +476,17 @@ def test_batches_of_windows_weigh_their_images():
     assert problem(moved) is not problem(params)
 
 
+def test_numbers_of_the_motion_are_searched_with_motion_found_anew():
+    mc = METHODS["mc"]
+    problem = Problem(Objective(mc), cut_windows(moving(), "held-out")[:1])
+
+    def paths(**values):
+        return problem(mc.Params(**values))[0][0].prepared.out.targets.p
+
+    assert paths() is paths(sigma_event=0.7)  # followed by gradient, with the motion at the start
+    assert np.abs(paths() - paths(smooth=4e3)).max() > 1e-3
+
+
 def test_references_weigh_their_regions():
     recording = moving()
     hdr = np.array([0.001, 0.5, 3.0, np.nan])[np.arange(WIDTH * HEIGHT) % 4]

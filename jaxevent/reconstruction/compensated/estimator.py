@@ -7,7 +7,7 @@ target (`trajectories`). Along these paths the images are fused (`fusion`).
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -53,11 +53,6 @@ from jaxevent.reconstruction.compensated.instants import (
     merge_instant_times,
     pad_instant_count,
     pad_with_last,
-)
-from jaxevent.reconstruction.compensated.normal_equations import (
-    CostParams,
-    MotionImages,
-    implicit_trajectories,
 )
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.robust_mean import (
@@ -371,16 +366,16 @@ class CompensatedVideo(ImageSequence[Params]):
 class MotionCompensation(ImageEstimator[Params]):
     """The motion-compensated reconstruction.
 
-    Attributes:
-        through_motion: Whether derivatives of the images that `read` returns go through the motion,
-            too, as through a fixpoint (`normal_equations.implicit_trajectories`). Otherwise motion
-            is constant. Values are the same.
+    The motion that `prepare` finds is constant in derivatives of the images that `read` returns.
     """
 
     options: frozenset[str] = dataclasses.field(
         default=frozenset({"window_events", "motion", "refine"}), kw_only=True
     )
-    through_motion: bool = dataclasses.field(default=False, kw_only=True)
+
+    def preparation_key(self, params: Params) -> Hashable:
+        numbers = {name: float(getattr(params, name)) for name in params.names_without_gradient()}
+        return EventTiming.of(params), *numbers.values()
 
     def prepare(
         self,
@@ -494,11 +489,9 @@ class MotionCompensation(ImageEstimator[Params]):
             images = (L[rows] - smooth, variances, clear[rows])
             at_frame = shape[layout.target] == 0
             factor = jnp.where(at_frame, 1, noise.factor[layout.target])
-            p = target.p
-            if self.through_motion:
-                p = self._with_derivative(params, images, layout, target.p)
-            paths = interpolate_paths_jax(p, *target.path_index.shape)
-            paths = paths.reshape(-1, 4)[target.path_index]
+            path_index = target.path_index
+            paths = interpolate_paths_jax(target.p, *path_index.shape)
+            paths = paths.reshape(-1, 4)[path_index]
             warped = warp_images_jax(*images, layout.path_times, paths)
             reach = squared_reach(paths, layout.common)
             fused = fuse(params, *images[:2], warped, layout, reach, noise=factor)
@@ -526,30 +519,6 @@ class MotionCompensation(ImageEstimator[Params]):
         image = (jnp.exp(found) - params.I0).reshape(len(found), -1)
         P = P.reshape(image.shape)
         return Estimate(image, P, jnp.isfinite(image) & (jnp.sqrt(P) < params.vague))
-
-    def _with_derivative(
-        self,
-        params: Params,
-        images: tuple[Array, Array, Array],
-        layout: InstantLayout,
-        p: Array,
-    ) -> Array:
-        """Make trajectories depend on images and parameters, for derivatives.
-
-        Args:
-            params: Parameters.
-            images: L, V and clear, each (k, h, w), as of `InstantImages`.
-            layout: The k instants.
-            p: (rows, columns, 4) converged trajectories of nodes, px.
-
-        Returns:
-            p with the derivatives of the fixpoint.
-        """
-        L, V, clear = images
-        cost = CostParams.of(params, lambda value: jnp.asarray(value, L.dtype))
-        variance = V * jnp.where(clear > 0, 1, params.caution)
-        motion_images = MotionImages(L, variance, layout.path_times, layout.present)
-        return implicit_trajectories(p, motion_images, cost)
 
     def estimate(
         self, recording: Recording, params: Params | None = None, **options: Any

@@ -59,7 +59,15 @@ class NoiseParams(NamedTuple):
 
     @classmethod
     def of(cls, params: Params, convert: Callable[[Any], Any] = float) -> "NoiseParams":
-        """Take the parameters of the noise from those of `mc`, converted."""
+        """Take the parameters of the noise from those of `mc`.
+
+        Args:
+            params: Parameters of `mc`.
+            convert: Conversion of each number.
+
+        Returns:
+            The parameters.
+        """
         return cls(*(convert(getattr(params, name)) for name in cls._fields))
 
 

@@ -1,50 +1,31 @@
-"""Normal equations of trajectories: in numba for their estimate, in JAX for its derivatives.
+"""Normal equations of trajectories.
 
 A Gauss-Newton step d of the trajectories p, one of four numbers for every node, solves
 
     (N + smooth Laplacian + ridge) d = b - smooth Laplacian p - ridge p
 
 with N and b of the images, and a Laplacian that weighs differences between neighbouring nodes.
-
-Converged trajectories are where the right-hand side vanishes, F(p, images, cost) = 0. So
-dp = A^-1 dF at fixed p, with A = -dF/dp. Derivatives solve these equations once, backwards the
-transposed ones. A is close to the normal matrix, which conjugate gradients invert as the
-preconditioner of the whole.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.scipy.sparse.linalg import bicgstab, cg
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from numpy.typing import NDArray
 
 from jaxevent.codegen import empty_row_scratch, njit_noalloc, njit_noalloc_inlined, run_over_rows
-from jaxevent.precision import full_precision
 from jaxevent.reconstruction.compensated.params import Params
 from jaxevent.reconstruction.compensated.warp import (
     PathTimes,
     RowScratch,
     bilinear_weights,
     gradient_at_pixel,
-    gradient_jax,
     interpolate_path,
-    interpolate_paths_jax,
-    is_in_image,
     locate_points,
-    pad_edges,
-    path_positions,
-    sample_bilinear,
-    sum_images,
 )
 from jaxevent.reconstruction.features import Numeric
 
 OUTSIDE_INFORMATION = np.float32(1e-6)  # of values outside the image
-# Iterations for derivatives: of conjugate gradients with the normal matrix, and of the whole.
-CG_ITERATIONS, BICGSTAB_ITERATIONS = 30, 8
 
 
 class CostParams(NamedTuple):
@@ -67,35 +48,27 @@ class CostParams(NamedTuple):
     straight: Numeric
 
     @classmethod
-    def of(cls, params: Params, convert: Callable[[Any], Any] = np.float32) -> "CostParams":
-        """Take the parameters of the cost from those of `mc`.
-
-        Args:
-            params: Parameters of `mc`.
-            convert: Conversion of each number.
-
-        Returns:
-            The parameters.
-        """
-        return cls(*(convert(getattr(params, name)) for name in cls._fields))
+    def of(cls, params: Params) -> "CostParams":
+        """Take the parameters of the cost from those of `mc`."""
+        return cls(*(np.float32(getattr(params, name)) for name in cls._fields))
 
 
 class NormalEquations(NamedTuple):
     """The equations of all nodes at some trajectories.
 
     Attributes:
-        N: (4, 4) matrix of each node, or the 10 entries of its upper triangle.
+        N: The 10 entries of the upper triangle of each node's (4, 4) matrix.
         b: Right-hand side of each node.
-        across: Weights of differences with the node right; for numba (rows, columns).
-        down: Weights of differences with the node below; for numba (rows, columns).
+        across: Weights of differences with the node right; the last column is not used.
+        down: Weights of differences with the node below; the last row is not used.
         smooth: Weight of the differences of each component.
         ridge: Weight of the square of each component.
     """
 
-    N: Float[Numeric, "rows columns *matrix"]
+    N: Float[Numeric, "rows columns 10"]
     b: Float[Numeric, "rows columns 4"]
-    across: Float[Numeric, "rows columns-1"]
-    down: Float[Numeric, "rows-1 columns"]
+    across: Float[Numeric, "rows columns"]
+    down: Float[Numeric, "rows columns"]
     smooth: Float[Numeric, " 4"]
     ridge: Float[Numeric, " 4"]
 
@@ -719,187 +692,3 @@ def _solve(eq, p, iterations, scratch, d):
         for c in range(channels):
             for j in range(columns):
                 d[i, j, c] = found[i, c, j]
-
-
-class MotionImages(NamedTuple):
-    """Images that motion is estimated from, for derivatives."""
-
-    L: Float[Numeric, "k h w"]  # log intensity
-    V: Float[Numeric, "k h w"]  # its variance, (ln I)^2
-    times: PathTimes
-    present: Float[Numeric, " k"]  # 1, or 0 of instants that only pad the number
-
-
-def _average_pixels(pixels: Array) -> Array:
-    """Average the 2 x 2 pixels (h, w, ...) of each node, (rows, columns, ...)."""
-    h, w = pixels.shape[:2]
-
-    def total(values: Array) -> Array:
-        widths = [(0, h % 2), (0, w % 2)] + [(0, 0)] * (values.ndim - 2)
-        padded = jnp.pad(values, widths)
-        return padded[::2, ::2] + padded[::2, 1::2] + padded[1::2, ::2] + padded[1::2, 1::2]
-
-    count = total(jnp.ones((h, w), pixels.dtype))
-    return total(pixels) / count.reshape(*count.shape, *[1] * (pixels.ndim - 2))
-
-
-def _smooth_nodes_jax(nodes: Array) -> Array:
-    """Blur nodes by (1, 6, 1) / 8."""
-    for axis in (0, 1):
-        padded, size = pad_edges(nodes, axis, 1), nodes.shape[axis]
-        a, b, c = (jax.lax.slice_in_dim(padded, i, i + size, axis=axis) for i in range(3))
-        nodes = (a + 6 * b + c) / 8
-    return nodes
-
-
-@full_precision
-def linearise_jax(p: Array, images: MotionImages, cost: CostParams) -> NormalEquations:
-    """Set up the normal equations at some trajectories of all instants; differentiable.
-
-    Args:
-        p: (rows, columns, 4) trajectories of nodes, px.
-        images: The images.
-        cost: Parameters of the cost.
-
-    Returns:
-        The equations, N as matrices (4, 4).
-    """
-    L, V, times, present = images
-    count, h, w = L.shape
-    Y, X = (one.astype(p.dtype) for one in path_positions(interpolate_paths_jax(p, h, w), times))
-    inside = is_in_image(Y, X, h, w)
-    gx, gy = gradient_jax(L)
-    L, V, gx, gy = (sample_bilinear(image, Y, X) for image in (L, V, gx, gy))
-    W = present[:, None, None] * jnp.where(inside, 1 / (V + cost.floor), OUTSIDE_INFORMATION)
-    s = jnp.asarray(times.s)[:, None, None]
-    R = W * jnp.exp(-2 * s**2)
-    M = sum_images(R * L) / sum_images(R)
-    for _ in range(2):
-        R = W / (1 + (L - M) ** 2 * W / cost.robust)
-        M = sum_images(R * L) / sum_images(R)
-    mx, my = gradient_jax(M)
-    J = jnp.stack([(gx + mx) / 2 * s, (gy + my) / 2 * s])
-    J = jnp.concatenate([J, J * s])
-    J = J - jax.vmap(sum_images)(R * J)[:, None] / sum_images(R)
-    N = jnp.einsum("khw,akhw,bkhw->hwab", R, J, J)
-    b = -jnp.einsum("khw,akhw,khw->hwa", R, J, L - M)
-    edge = _average_pixels(jnp.sqrt(mx**2 + my**2 + 1e-20))
-
-    def weights(axis: int) -> Array:
-        difference = jnp.diff(p[..., :2], axis=axis)
-        one, other = ((edge[:, :-1], edge[:, 1:]), (edge[:-1], edge[1:]))[axis == 0]
-        weight = cost.jump / jnp.sqrt((difference**2).sum(-1) + cost.jump**2)
-        return weight * (0.1 + 0.9 * jnp.exp(-(one + other) / 2 / cost.edge))
-
-    tiny = 1e-5 * cost.smooth
-    ridge = jnp.stack([tiny, tiny, cost.straight, cost.straight])
-    N, b = (_smooth_nodes_jax(_average_pixels(part)) for part in (N, b))
-    return NormalEquations(N, b, weights(1), weights(0), cost.smooth * jnp.ones(4, p.dtype), ridge)
-
-
-def _apply_smoothness(eq: NormalEquations, q: Array) -> Array:
-    """Return (smooth Laplacian + ridge) q.
-
-    Args:
-        eq: Equations of the nodes.
-        q: (rows, columns, 4).
-
-    Returns:
-        (rows, columns, 4).
-    """
-    x = eq.across[..., None] * jnp.diff(q, axis=1)
-    y = eq.down[..., None] * jnp.diff(q, axis=0)
-    rough = jnp.pad(x, [(0, 0), (1, 0), (0, 0)]) - jnp.pad(x, [(0, 0), (0, 1), (0, 0)])
-    rough = rough + jnp.pad(y, [(1, 0), (0, 0), (0, 0)]) - jnp.pad(y, [(0, 1), (0, 0), (0, 0)])
-    return eq.smooth * rough + eq.ridge * q
-
-
-def normal_equation_residual(p: Array, images: MotionImages, cost: CostParams) -> Array:
-    """Return the right-hand side of the normal equations, which vanishes at convergence.
-
-    Args:
-        p: (rows, columns, 4) trajectories of nodes, px.
-        images: The images.
-        cost: Parameters of the cost.
-
-    Returns:
-        F, (rows, columns, 4).
-    """
-    eq = linearise_jax(p, images, cost)
-    return eq.b - _apply_smoothness(eq, p)
-
-
-@full_precision
-def _solve_jax(eq: NormalEquations, right: Array) -> Array:
-    """Solve the normal equations by conjugate gradients, preconditioned node by node.
-
-    Args:
-        eq: Equations of the nodes, with `N` as matrices (4, 4).
-        right: (rows, columns, 4) right-hand side.
-
-    Returns:
-        (rows, columns, 4).
-    """
-    degree = jnp.pad(eq.across, [(0, 0), (1, 0)]) + jnp.pad(eq.across, [(0, 0), (0, 1)])
-    degree = degree + jnp.pad(eq.down, [(1, 0), (0, 0)]) + jnp.pad(eq.down, [(0, 1), (0, 0)])
-    diagonal = eq.smooth * degree[..., None] + eq.ridge + 1e-6
-    blocks = jnp.linalg.inv(eq.N + diagonal[..., None] * jnp.eye(4, dtype=right.dtype))
-
-    def times(q: Array) -> Array:
-        return jnp.einsum("ijab,ijb->ija", eq.N, q) + _apply_smoothness(eq, q)
-
-    def precondition(q: Array) -> Array:
-        return jnp.einsum("ijab,ijb->ija", blocks, q)
-
-    return cg(times, right, tol=1e-6, maxiter=CG_ITERATIONS, M=precondition)[0]
-
-
-@jax.custom_jvp
-def implicit_trajectories(p: Array, images: MotionImages, cost: CostParams) -> Array:
-    """Make converged trajectories a differentiable function of images and cost.
-
-    Derivatives are those of the fixpoint. Clipped steps and medians, which act away from it, have
-    none, and neither have instants and nodes, which are chosen by data.
-
-    Args:
-        p: (rows, columns, 4) converged trajectories of nodes, px.
-        images: The images.
-        cost: Parameters of the cost.
-
-    Returns:
-        p as it is.
-    """
-    return p
-
-
-@implicit_trajectories.defjvp
-def _differentiate(values: tuple, changes: tuple) -> tuple[Array, Array]:
-    """Differentiate `implicit_trajectories`: with F = 0 at the fixpoint, dF/dp dp = -dF.
-
-    Args:
-        values: Its arguments.
-        changes: Their tangents.
-
-    Returns:
-        p, (rows, columns, 4), px, and its tangent.
-    """
-    p, images, cost = values
-    _, *changes_of_data = changes
-    eq = linearise_jax(p, images, cost)
-
-    _, change = jax.linearize(lambda q: normal_equation_residual(q, images, cost), p)
-
-    def times(dp: Array) -> Array:
-        """Return A dp."""
-        return -change(dp)
-
-    def solve_all(product: Callable[[Array], Array], right: Array) -> Array:
-        def precondition(other: Array) -> Array:
-            return _solve_jax(eq, other)
-
-        return bicgstab(product, right, tol=1e-5, maxiter=BICGSTAB_ITERATIONS, M=precondition)[0]
-
-    _, dF = jax.jvp(
-        lambda *data: normal_equation_residual(p, *data), (images, cost), tuple(changes_of_data)
-    )
-    return p, jax.lax.custom_linear_solve(times, dF, solve_all, solve_all)

@@ -1,7 +1,7 @@
 """The method `events-only`: video from events alone."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -29,6 +29,7 @@ from jaxevent.reconstruction.events_only.video import (
 )
 from jaxevent.reconstruction.events_only.windows import SolvedWindow, WindowSolver
 from jaxevent.reconstruction.features import Numeric
+from jaxevent.reconstruction.frames import EventTiming
 from jaxevent.recording import Recording, Times
 
 HELD_OUT_STEP = 5  # one of so many events is predicted by the others
@@ -86,6 +87,10 @@ class EventsOnly(ImageEstimator[Params]):
     options: frozenset[str] = dataclasses.field(
         default=frozenset({"causal", "motion"}), kw_only=True
     )
+
+    def preparation_key(self, params: Params) -> Hashable:
+        numbers = {name: float(getattr(params, name)) for name in params.names_without_gradient()}
+        return EventTiming.of(params), *numbers.values()
 
     def prepare(
         self,
