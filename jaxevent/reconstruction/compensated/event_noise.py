@@ -49,7 +49,15 @@ class IntervalNoise(NamedTuple):
 
 
 class NoiseParams(NamedTuple):
-    """Parameters of `mc` that the expected noise of events depends on, each ()."""
+    """Parameters of `mc` that the expected noise of events depends on.
+
+    Attributes:
+        c_on: Contrast threshold of ON events, ln I.
+        c_off: Contrast threshold of OFF events, ln I.
+        sigma_event: Noise of an event's step, relative to its threshold.
+        sigma_bg: Drift without events, ln I / sqrt(s).
+        share: Fraction of an event's change that belongs to its 8 neighbours.
+    """
 
     c_on: Numeric | float
     c_off: Numeric | float
