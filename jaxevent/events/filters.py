@@ -11,7 +11,7 @@ from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
 from jaxevent.events.blocks import Part, Size, parse_duration, select_events, size_of, source_of
 from jaxevent.events.images import count_events
-from jaxevent.recording import Events, Recording, Times, microseconds
+from jaxevent.recording import Events, Recording, Times, one_time
 
 LONG_AGO_US = np.iinfo(np.int64).min // 2  # us
 
@@ -35,7 +35,7 @@ def crop_time(part: Part, start: Times | None = None, stop: Times | None = None)
     if isinstance(part, Recording):
         return part[start:stop]
     source = source_of(part)
-    ends = [None if time is None else int(microseconds(time)) for time in (start, stop)]
+    ends = [None if time is None else one_time(time) for time in (start, stop)]
     return part[slice(*(None if us is None else source.index(us) for us in ends))]
 
 
