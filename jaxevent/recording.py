@@ -901,10 +901,10 @@ class Recording(HtmlRepr):
     left_out: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
-        if not isinstance(self.name, str):
+        if not isinstance(self.name, str) or "\0" in self.name:
             raise InputError(
                 f"name is {arrays.shorten_value(self.name)}, a {type(self.name).__name__}; give "
-                "a text, the recording's name"
+                "a text without the character NUL, the recording's name"
             )
         size = arrays.as_size(self.width, self.height, self.name)
         for side, pixels in zip(("width", "height"), size, strict=True):
@@ -925,6 +925,12 @@ class Recording(HtmlRepr):
             part = getattr(self, field)
             if not isinstance(part, kind) and (part is not None or field not in parts):
                 raise InputError(f"{self.name}: {field} is a {type(part).__name__}; give {remedy}")
+        for key in self.extra:
+            if not isinstance(key, str):
+                raise InputError(
+                    f"{self.name}: {arrays.shorten_value(key)} is no name of a further array "
+                    "(extra); give a text"
+                )
         if self.frames is not None:
             self.frames.check_shape(self.width, self.height, self.name)
         if self.camera is not None:
@@ -1056,12 +1062,14 @@ class Recording(HtmlRepr):
     @property
     def start(self) -> int:
         """Time of the first event or frame in us; the filters' time zero."""
+        self.refuse_empty()
         first = [int(self.events[:1].t[0])] if len(self.events) else []
         return min(first + ([int(self.frames.t[0])] if self.frames else []))
 
     @property
     def stop(self) -> int:
         """Time of the last event or frame in us."""
+        self.refuse_empty()
         last = [int(self.events[len(self.events) - 1 :].t[0])] if len(self.events) else []
         return max(last + ([int(self.frames.t[-1])] if self.frames else []))
 

@@ -119,6 +119,13 @@ def test_a_list_of_lists_of_times_is_refused(bar):
          "^the window of the background filter is 'abc'; give one finite number"),
         (lambda r: unchecked(jaxevent.events.filter_refractory)(r, [1, 2]), r"period is \[1, 2\]"),
         (lambda r: jaxevent.events.filter_background(r, float("nan")), "filter is nan; give one"),
+        (lambda r: dataclasses.replace(r, events=jaxevent.Events.empty()).start, "no event and no"),
+        (lambda r: dataclasses.replace(r, events=jaxevent.Events.empty())[0.0:1.0], "and no frame"),
+        (lambda r: dataclasses.replace(r, name="a\0b"), "without the character NUL"),
+        (lambda r: dataclasses.replace(r, extra={5: 1}), "5 is no name of a further array"),
+        (lambda r: unchecked(jaxevent.events.voxel_grid)(r, True), "True bins .* whole number"),
+        (lambda r: unchecked(jaxevent.events.remove_hot_pixels)(r, [True]), r"of shape \(1,\)"),
+        (lambda r: unchecked(jaxevent.events.remove_hot_pixels)(r, "a"), "hot is a str; give an"),
         (lambda r: video_writer("a.gif", 30).__enter__(), "a.gif: .* end the name in .mp4"),
     ],
 )  # fmt: skip

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.arrays import shorten_value
+from jaxevent.arrays import as_array, shorten_value
 from jaxevent.codegen import njit
 from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
@@ -122,6 +122,7 @@ def remove_hot_pixels(
     width, height = size_of(part, size)
     if hot is None:
         hot = find_hot_pixels(part, size=size)
+    hot = as_array(hot, "hot")
     if hot.shape != (height, width) or hot.dtype != np.bool_:
         raise InputError(
             f"hot pixels are {hot.dtype} of shape {hot.shape}; give bool of ({height}, {width})"

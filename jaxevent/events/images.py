@@ -234,7 +234,7 @@ def voxel_grid(
     Raises:
         InputError: There is no bin.
     """
-    if not isinstance(bins, int | np.integer) or bins < 1:
+    if isinstance(bins, bool) or not isinstance(bins, int | np.integer) or bins < 1:
         raise InputError(
             f"a voxel grid of {shorten_value(bins)} bins is not possible; give a whole number "
             "from 1"

@@ -126,8 +126,9 @@ def reading(source: object) -> Iterator[None]:
         raise
     except Exception as error:
         if isinstance(error, OSError) and error.filename is not None:
+            place = "" if str(error.filename) in str(source) else f": {error.filename}"
             raise InputError(
-                f"{source}: cannot be read ({error.strerror}); check the path"
+                f"{source}: cannot be read ({error.strerror}{place}); check the path"
             ) from error
         reason = " ".join(str(error).split()) or type(error).__name__
         reason = reason if len(reason) < 200 else reason[:200] + "..."

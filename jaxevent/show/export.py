@@ -251,7 +251,8 @@ def _write_video(video: ImageSequence, times: NDArray, out: Path, options: Expor
     Returns:
         The end of a sentence about the file.
     """
-    rate = (len(times) - 1) / ((times[-1] - times[0]) / 1e6) if len(times) > 1 else 25.0
+    seconds = (times[-1] - times[0]) / 1e6
+    rate = (len(times) - 1) / seconds if seconds > 0 else 25.0
     fps = min(rate, 60.0)
     range_used = RangeCounter(options.tone)
     with video_writer(out, fps) as write:

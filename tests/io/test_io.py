@@ -767,7 +767,7 @@ def test_load_refuses_other_things(tmp_path):
     with File(other, "w") as file:
         for number in range(12):
             file[f"some/{number:02}"] = np.zeros((3, 2), np.int16)
-    refuses(r"holds some/00 int16 \(3, 2\), some/01 .*, 4 more; read .* from_arrays", load, other)
+    refuses(r"holds some/00 int16 \(3, 2\), some/01 .*, 4 more; read .*from_arrays", load, other)
     with File(other, "w"):
         pass
     refuses("it holds no dataset; read", load, other)
