@@ -61,6 +61,28 @@ def microseconds(time: Times, what: str = "times") -> NDArray[np.int64]:
     return np.asarray(scaled).astype(np.int64)
 
 
+def one_time(time: Any, what: str = "the time") -> int:
+    """Convert one time, or one length of time, to microseconds, as `microseconds` does.
+
+    Args:
+        time: The time.
+        what: Its name for messages.
+
+    Returns:
+        The time, us.
+
+    Raises:
+        InputError: It is no number, several, not finite, or too large for int64.
+    """
+    try:
+        return int(microseconds(time, what))
+    except (ValueError, TypeError):
+        raise InputError(
+            f"{what} is {arrays.shorten_value(time)}; give one finite number, an integer of "
+            "microseconds or a float of seconds"
+        ) from None
+
+
 def check_recording(recording: Any, call: str, or_events: bool = False) -> None:
     """Raise `InputError` unless an argument is a `Recording`, naming the remedy.
 
@@ -275,12 +297,12 @@ class Events:
 
     def __getitem__(self, rows: slice | NDArray) -> "Events":
         """Return the events of a slice, a mask or row numbers that rise."""
+        rows = _check_rows(rows, "events", len(self))
         if isinstance(rows, slice) and rows.step in (None, 1):
             return Events.of_checked(self.t[rows], self.x[rows], self.y[rows], self.p[rows])
-        _check_rows(rows, "events")
         columns = (np.ascontiguousarray(getattr(self, name)[rows]) for name in "txyp")
         part = Events.of_checked(*columns)
-        if isinstance(rows, slice) or np.asarray(rows).dtype.kind != "b":
+        if isinstance(rows, slice) or rows.dtype.kind != "b":
             part.check_order("events")
         return part
 
@@ -352,18 +374,69 @@ class Events:
             arrays.coordinates(name, values, (width, height), source, first_row=first_row)
 
 
-def _check_rows(rows: Any, what: str) -> None:
-    """Raise `InputError` for rows that choose one row, or several columns, of `what`.
+def _check_rows(rows: Any, what: str, number: int) -> slice | NDArray:
+    """Check that rows choose several of a number of things.
 
     Args:
         rows: Rows as a caller gives them.
-        what: Name of the whole, for messages.
+        what: Name of the things, for messages.
+        number: Number of the things.
+
+    Returns:
+        A slice, a mask of all rows, or row numbers.
+
+    Raises:
+        InputError: They choose one row, several columns, or rows that are not there.
     """
-    if not isinstance(rows, slice) and (np.ndim(rows) != 1 or np.asarray(rows).dtype.kind == "O"):
+    if isinstance(rows, slice):
+        try:
+            rows.indices(number)
+        except (TypeError, ValueError):
+            raise InputError(
+                f"{what}[{rows.start}:{rows.stop}] is not a range of rows; give whole numbers, or "
+                "choose times by recording[start:stop] (integers are microseconds, floats seconds)"
+            ) from None
+        return rows
+    chosen = np.asarray(rows) if np.ndim(rows) == 1 else np.empty(0, object)
+    if chosen.dtype.kind == "f" and not len(chosen):
+        return chosen.astype(np.int64)
+    if chosen.dtype.kind not in "biu":
         raise InputError(
             f"{what} are chosen by a slice, a mask or a list of rows, "
             f"not {arrays.shorten_value(rows)}; write {what}[row : row + 1] for one of them"
         )
+    if chosen.dtype.kind == "b":
+        if len(chosen) != number:
+            raise InputError(
+                f"{what} are chosen by a mask of {len(chosen):,} values, but there are "
+                f"{number:,}; give one value for each"
+            )
+    elif len(chosen) and not -number <= chosen.min() <= chosen.max() < number:
+        wrong = chosen.min() if chosen.min() < -number else chosen.max()
+        raise InputError(
+            f"{what} have no row {wrong}, for there are {number:,}; give rows from 0 to below that"
+        )
+    return chosen
+
+
+def slice_bounds(rows: Any, count: int, what: str = "events in a file") -> tuple[int, int]:
+    """Return the bounds of a slice of events that are read piece by piece.
+
+    Args:
+        rows: The slice, of step 1.
+        count: Number of events.
+        what: Name of the events for messages.
+
+    Returns:
+        First row, and the row after the last one.
+
+    Raises:
+        InputError: The rows are no slice, or its step is another.
+    """
+    rows = _check_rows(rows, "events", count)
+    if not isinstance(rows, slice) or rows.step not in (None, 1):
+        raise InputError(f"{what} are read as a range of rows, events[i:j], step 1")
+    return rows.indices(count)[:2]
 
 
 class CheckedEvents:
@@ -380,9 +453,7 @@ class CheckedEvents:
         return len(self._source)
 
     def __getitem__(self, rows: slice) -> Events:
-        start, stop, step = rows.indices(len(self))
-        if step != 1:
-            raise InputError(f"{self._name} are read as a range of rows, events[i:j], step 1")
+        start, stop = slice_bounds(rows, len(self), self._name)
         if stop <= start:
             return Events.empty()
         # The event before the range is read too, so that pieces are sorted as a whole.
@@ -541,7 +612,7 @@ class Frames:
 
     def __getitem__(self, rows: slice | NDArray) -> "Frames":
         """Return the frames of a slice, a mask or row numbers that rise."""
-        _check_rows(rows, "frames")
+        rows = _check_rows(rows, "frames", len(self))
         part = Frames.of_checked(self.t[rows], self.images[rows], self.exposure[rows])
         if not isinstance(rows, slice) or (rows.step or 1) < 1:
             part._check_times("frames")
@@ -673,6 +744,7 @@ class _TimedRows:
         return len(self.t)
 
     def __getitem__(self, rows: slice | NDArray) -> Self:
+        rows = _check_rows(rows, "rows", len(self))
         return type(self)(*(values[rows] for values in vars(self).values()))
 
 
@@ -829,10 +901,10 @@ class Recording(HtmlRepr):
     left_out: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
-        if not isinstance(self.name, str):
+        if not isinstance(self.name, str) or "\0" in self.name:
             raise InputError(
                 f"name is {arrays.shorten_value(self.name)}, a {type(self.name).__name__}; give "
-                "a text, the recording's name"
+                "a text without the character NUL, the recording's name"
             )
         size = arrays.as_size(self.width, self.height, self.name)
         for side, pixels in zip(("width", "height"), size, strict=True):
@@ -853,6 +925,12 @@ class Recording(HtmlRepr):
             part = getattr(self, field)
             if not isinstance(part, kind) and (part is not None or field not in parts):
                 raise InputError(f"{self.name}: {field} is a {type(part).__name__}; give {remedy}")
+        for key in self.extra:
+            if not isinstance(key, str):
+                raise InputError(
+                    f"{self.name}: {arrays.shorten_value(key)} is no name of a further array "
+                    "(extra); give a text"
+                )
         if self.frames is not None:
             self.frames.check_shape(self.width, self.height, self.name)
         if self.camera is not None:
@@ -984,12 +1062,14 @@ class Recording(HtmlRepr):
     @property
     def start(self) -> int:
         """Time of the first event or frame in us; the filters' time zero."""
+        self.refuse_empty()
         first = [int(self.events[:1].t[0])] if len(self.events) else []
         return min(first + ([int(self.frames.t[0])] if self.frames else []))
 
     @property
     def stop(self) -> int:
         """Time of the last event or frame in us."""
+        self.refuse_empty()
         last = [int(self.events[len(self.events) - 1 :].t[0])] if len(self.events) else []
         return max(last + ([int(self.frames.t[-1])] if self.frames else []))
 
@@ -1046,8 +1126,8 @@ class Recording(HtmlRepr):
         """Return the part with start <= t < stop; ints are us, floats s, of its clock."""
         if not isinstance(span, slice) or span.step is not None:
             raise TypeError("slice a recording by two times: recording[t0:t1]")
-        t0 = self.start if span.start is None else int(microseconds(span.start))
-        t1 = self.stop + 1 if span.stop is None else int(microseconds(span.stop))
+        t0 = self.start if span.start is None else one_time(span.start, "the start")
+        t1 = self.stop + 1 if span.stop is None else one_time(span.stop, "the stop")
 
         if t1 < t0 and span.start is not None and span.stop is not None:
             raise InputError(

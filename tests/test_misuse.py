@@ -109,12 +109,46 @@ def test_a_list_of_lists_of_times_is_refused(bar):
         (lambda r: jaxevent.save("a.h5", r), r"the path is a Recording; .*save\(recording, path"),
         (lambda r: jaxevent.flow_from_events(
             dataclasses.replace(r, events=jaxevent.Events.empty())), "holds no events"),
+        (lambda r: r.events[[len(r.events)]], "events have no row .* give rows from 0 to below"),
+        (lambda r: r.events[[0, -9_999_999]], "events have no row -9999999"),
+        (lambda r: r.events[[1.5]], "by a slice, a mask or a list of rows"),
+        (lambda r: r.events[[True]], "a mask of 1 values, but there are .* one value for each"),
+        (lambda r: unchecked(r.events.__getitem__)(slice(0.1, 0.2)), r"recording\[start:stop\]"),
+        (lambda r: r[[1, 2]:], r"the start is \[1, 2\]; give one finite number"),
+        (lambda r: unchecked(jaxevent.events.filter_background)(r, "abc"),
+         "^the window of the background filter is 'abc'; give one finite number"),
+        (lambda r: unchecked(jaxevent.events.filter_refractory)(r, [1, 2]), r"period is \[1, 2\]"),
+        (lambda r: jaxevent.events.filter_background(r, float("nan")), "filter is nan; give one"),
+        (lambda r: dataclasses.replace(r, events=jaxevent.Events.empty()).start, "no event and no"),
+        (lambda r: dataclasses.replace(r, events=jaxevent.Events.empty())[0.0:1.0], "and no frame"),
+        (lambda r: dataclasses.replace(r, name="a\0b"), "without the character NUL"),
+        (lambda r: dataclasses.replace(r, extra={5: 1}), "5 is no name of a further array"),
+        (lambda r: unchecked(jaxevent.events.voxel_grid)(r, True), "True bins .* whole number"),
+        (lambda r: unchecked(jaxevent.events.remove_hot_pixels)(r, [True]), r"of shape \(1,\)"),
+        (lambda r: unchecked(jaxevent.events.remove_hot_pixels)(r, "a"), "hot is a str; give an"),
         (lambda r: video_writer("a.gif", 30).__enter__(), "a.gif: .* end the name in .mp4"),
     ],
 )  # fmt: skip
 def test_likely_slips_are_refused(call, said, bar):
     with pytest.raises(InputError, match=said):
         call(bar)
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [([9], "have no row 9, for there are 3"), ([0, -4], "no row -4"), (1, "a list of rows, not 1"),
+     ([True] * 2, "a mask of 2 values"), (slice(0.0, 0.1), "not a range of rows")],
+)  # fmt: skip
+def test_rows_that_are_not_there_are_refused(rows, said, bar):
+    t = np.arange(3) * 10_000
+    frames = jaxevent.Frames(t, np.zeros((3, 48, 64), np.uint8), t * 0)
+    imu = jaxevent.recording.Imu(t, np.zeros((3, 3)))
+    recording = dataclasses.replace(bar, frames=frames, imu=imu)
+    for choose in (recording.with_frames, frames.__getitem__, imu.__getitem__):
+        with pytest.raises(InputError, match=said):
+            choose(rows)
+    assert len(recording.with_frames(np.array([-1])).frames) == 1
+    assert recording.with_frames([]).frames is None
 
 
 @pytest.mark.parametrize(("off", "on"), [(False, True), (0, 1), (-1, 1.0), (np.int8(-1), np.True_)])

@@ -29,7 +29,7 @@ from jaxevent.blob.seeds import Seeds, read_seeds
 from jaxevent.blob.track import TrackBuffer, TrackStates, is_alive, readout
 from jaxevent.errors import InputError
 from jaxevent.events.live import Tail
-from jaxevent.recording import Events, Recording, Times, microseconds
+from jaxevent.recording import Events, Recording, Times, microseconds, one_time
 from jaxevent.threads import TurnLock, refuse_to_pickle, synchronized
 
 STEPS_PER_CHUNK, CHUNKS_PER_RUN = 64, 8
@@ -85,7 +85,7 @@ class LiveTracks:
         self._seed_ids: list[int] = []  # the number of each seed
         self._detected_ids: dict[int, int] = {}  # numbers of living targets by serial number
         self._pending_seeds: list[Seeds] = []
-        self._start = None if start is None else int(microseconds(start, "the start"))
+        self._start = None if start is None else one_time(start, "the start")
         if self._start is not None:
             self._start_tracking(self._start)
         self._add_seeds(seeds)

@@ -26,7 +26,7 @@ from jaxevent.codegen import njit_noalloc
 from jaxevent.errors import InputError
 from jaxevent.estimator import ShortRepr
 from jaxevent.events.filters import find_supported
-from jaxevent.recording import Recording, Times, check_times, microseconds
+from jaxevent.recording import Recording, Times, check_times, one_time
 
 STEPS_PER_CHUNK_CHOICES = (4, 8, 16, 32, 64, 128, 256)  # possible numbers
 STEPS_PER_SEGMENT = 8192
@@ -176,7 +176,7 @@ class ChunkPacker:
             )
             self.found_edges = [path.lone_edge for path in found.paths]
             self.overrides |= found.per_target_values(params)
-        earliest = None if start is None else int(microseconds(start, "the start"))
+        earliest = None if start is None else one_time(start, "the start")
         self.seeds = read_seeds(recording, seeds, begin, end, earliest)
         # Without births and tentative tracks less is to be decided.
         self.period = max(1, round((1 if detect else 10) * 1e6 * float(params.cycle)))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
-from jaxevent.recording import Recording, microseconds
+from jaxevent.recording import Recording, one_time
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +62,7 @@ def read_seeds(
                 f"{name} at ({x:g}, {y:g}) is outside the {recording.width}x{recording.height} "
                 "sensor; give pixel coordinates from 0"
             )
-        at = int(microseconds(time[0], f"the time of seed {number}")) if time else start
+        at = one_time(time[0], f"the time of seed {number}") if time else start
         if not (start if earliest is None else earliest) <= at < stop:
             raise InputError(
                 f"{name} begins at {at} us, but events are used from {start} to {stop - 1} us; "
@@ -109,8 +109,8 @@ def tracking_span(
     else:
         first, last = recording.event_span()
         last += 1
-    begin = first if start is None else int(microseconds(start, "the start"))
-    end = last if stop is None else int(microseconds(stop, "the stop"))
+    begin = first if start is None else one_time(start, "the start")
+    end = last if stop is None else one_time(stop, "the stop")
     used = begin, end
     if len(recording.events) and not live:
         used = max(begin, first), min(end, last)

@@ -20,7 +20,7 @@ from jaxevent.display import HtmlRepr
 from jaxevent.errors import InputError
 from jaxevent.precision import to_jax
 from jaxevent.progress import bar
-from jaxevent.recording import Times, microseconds
+from jaxevent.recording import Times, microseconds, one_time
 from jaxevent.threads import TurnLock
 
 if TYPE_CHECKING:
@@ -379,8 +379,8 @@ class Tracks(HtmlRepr):
         Raises:
             InputError: A time is not finite.
         """
-        t0 = self.start if start is None else int(microseconds(start, "the start"))
-        t1 = self.stop if stop is None else int(microseconds(stop, "the stop"))
+        t0 = self.start if start is None else one_time(start, "the start")
+        t1 = self.stop if stop is None else one_time(stop, "the stop")
         t0, t1 = max(t0, self.start), min(t1, self.stop)
         if t0 >= t1 or not self._checkpoints:
             return

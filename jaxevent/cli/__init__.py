@@ -83,9 +83,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         _silence(sys.stdout)
         return 128 + signal.SIGPIPE if hasattr(signal, "SIGPIPE") else 1
     except OSError as error:
-        # Files' errors are `InputError`s by now: what remains is that of printing.
+        # Errors within files are `InputError`s by now: what remains is that of a name, as one
+        # that is too long, and of printing.
         if error.filename is not None:
-            raise
+            _say(
+                f"{error.filename}: cannot be used ({error.strerror}); choose another name or place"
+            )
+            return 2
+        if isinstance(error, FileNotFoundError):
+            _say("the working folder is no longer there; change to another one")
+            return 2
         _silence(sys.stdout)
         _say(f"what was to be printed cannot be written ({error.strerror or error})")
         return 2

@@ -106,7 +106,8 @@ def run(
     if polarity is not None:
         steps.append(("polarity", lambda r: events.select_polarity(r, polarity == "on")))
     if downsample is not None or period is not None:
-        steps.append(("downsample", lambda r: events.downsample(r, downsample or 1, period or 0)))
+        factor = 1 if downsample is None else downsample
+        steps.append(("downsample", lambda r: events.downsample(r, factor, period or 0)))
     if not steps:
         raise InputError(
             f"{source}: no filter is given; name a step, for example --hot-pixels, "

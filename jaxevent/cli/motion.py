@@ -236,6 +236,8 @@ def _check_options(options: Options, kind: "type[Model] | None") -> None:
         raise InputError("there is nowhere to write; give a folder, --out DIR, or --live")
     if kind is not None:
         _check_method(find_estimator(options.method or kind.best_method), kind, options)
+    elif options.method is not None:
+        find_estimator(options.method)
     if options.causal and (options.centred or options.smooth):
         raise InputError("--causal uses no later events; leave out --centred and --smooth")
     arguments.check_seed(options.seed)

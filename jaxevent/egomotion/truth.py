@@ -23,7 +23,7 @@ from jaxevent.deprecated import renamed_fields, renamed_methods, renamed_names
 from jaxevent.egomotion.models import Model, find_model, in_words, unit_vectors
 from jaxevent.errors import InputError, InputWarning
 from jaxevent.io.tables import read_table
-from jaxevent.recording import Imu, Poses, Recording, Times, check_recording, microseconds
+from jaxevent.recording import Imu, Poses, Recording, Times, check_recording, microseconds, one_time
 
 # Rotations from the axes of an IMU to the camera's, x to the right, y down, z forward, by name.
 IMU_AXES = {
@@ -131,7 +131,7 @@ def twists_from_poses(poses: Poses, span: float | int = 0.0) -> Twists:
         raise InputError("poses hold values that are not finite; remove these poses")
     if (np.abs(poses.quaternion).sum(-1) == 0).any():
         raise InputError("poses hold a quaternion of length 0; remove these poses")
-    later = np.searchsorted(t, t + max(int(microseconds(float(span))), 1))
+    later = np.searchsorted(t, t + max(one_time(float(span), "the span"), 1))
     first = np.flatnonzero((later < len(t)) & np.append(np.diff(t) > 0, True))
     if not len(first):
         raise InputError(
@@ -219,7 +219,9 @@ def gyro_bias(imu: Imu, start: Times, stop: Times) -> NDArray[np.float64]:
     Raises:
         InputError: There is no sample in that time.
     """
-    rows = slice(*np.searchsorted(imu.t, [int(microseconds(start)), int(microseconds(stop))]))
+    rows = slice(
+        *np.searchsorted(imu.t, [one_time(start, "the start"), one_time(stop, "the stop")])
+    )
     if rows.start >= rows.stop:
         raise InputError(
             f"no gyro sample lies between {start} and {stop}; integers are microseconds, floats "

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from jaxevent.errors import InputError
 from jaxevent.progress import bar
-from jaxevent.recording import Events, EventSource, Recording, check_recording, microseconds
+from jaxevent.recording import Events, EventSource, Recording, check_recording, one_time
 
 Part = TypeVar("Part", Events, Recording)
 Size = tuple[int, int]
@@ -48,7 +48,7 @@ def size_of(part: Any, size: Size | None) -> Size:
     return size
 
 
-def parse_duration(length: int | float, what: str, least: int = 1) -> int:
+def parse_duration(length: Any, what: str, least: int = 1) -> int:
     """Convert a length of time to us.
 
     Args:
@@ -60,9 +60,9 @@ def parse_duration(length: int | float, what: str, least: int = 1) -> int:
         The length, us.
 
     Raises:
-        InputError: The length is shorter than `least`.
+        InputError: The length is no number, or shorter than `least`.
     """
-    us = int(microseconds(length, what))
+    us = one_time(length, what)
     if us < least:
         raise InputError(
             f"{what} is {us} us; give {least} us or more (integers are microseconds, floats "

@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxevent.arrays import shorten_value
+from jaxevent.arrays import as_array, shorten_value
 from jaxevent.codegen import njit
 from jaxevent.deprecated import renamed_names
 from jaxevent.errors import InputError
 from jaxevent.events.blocks import Part, Size, parse_duration, select_events, size_of, source_of
 from jaxevent.events.images import count_events
-from jaxevent.recording import Events, Recording, Times, microseconds
+from jaxevent.recording import Events, Recording, Times, one_time
 
 LONG_AGO_US = np.iinfo(np.int64).min // 2  # us
 
@@ -35,7 +35,7 @@ def crop_time(part: Part, start: Times | None = None, stop: Times | None = None)
     if isinstance(part, Recording):
         return part[start:stop]
     source = source_of(part)
-    ends = [None if time is None else int(microseconds(time)) for time in (start, stop)]
+    ends = [None if time is None else one_time(time) for time in (start, stop)]
     return part[slice(*(None if us is None else source.index(us) for us in ends))]
 
 
@@ -122,6 +122,7 @@ def remove_hot_pixels(
     width, height = size_of(part, size)
     if hot is None:
         hot = find_hot_pixels(part, size=size)
+    hot = as_array(hot, "hot")
     if hot.shape != (height, width) or hot.dtype != np.bool_:
         raise InputError(
             f"hot pixels are {hot.dtype} of shape {hot.shape}; give bool of ({height}, {width})"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from jaxevent.arrays import shorten_value
 from jaxevent.errors import InputError
 from jaxevent.events.blocks import Size, parse_duration, read_blocks, size_of, source_of
-from jaxevent.recording import Events, Recording, Times, microseconds
+from jaxevent.recording import Events, Recording, Times, microseconds, one_time
 
 Numeric = Array | np.ndarray
 
@@ -75,7 +75,7 @@ def to_device(
     if count > length:
         raise InputError(f"{count} events do not fit into arrays of {length}; give a larger length")
     zero = int(events.t[0]) if count and origin is None else 0
-    since = events.t - (zero if origin is None else int(microseconds(origin, "the origin")))
+    since = events.t - (zero if origin is None else one_time(origin, "the origin"))
     if count and max(abs(int(since[0])), abs(int(since[-1]))) >= 2**31:
         raise InputError(
             f"events from {events.t[0]} to {events.t[-1]} us are more than 2^31 us from the "
@@ -234,7 +234,7 @@ def voxel_grid(
     Raises:
         InputError: There is no bin.
     """
-    if not isinstance(bins, int | np.integer) or bins < 1:
+    if isinstance(bins, bool) or not isinstance(bins, int | np.integer) or bins < 1:
         raise InputError(
             f"a voxel grid of {shorten_value(bins)} bins is not possible; give a whole number "
             "from 1"
@@ -329,7 +329,7 @@ def _fill_ends(part: AnyEvents, start: Any, stop: Any) -> tuple[Any, Any]:
     source, us = source_of(part), []
     for time, row in ((start, 0), (stop, len(source) - 1)):
         if time is not None:
-            us.append(int(microseconds(time)))
+            us.append(one_time(time))
         else:
             us.append(int(source[row : row + 1].t[0]) if len(source) else 0)
     return us[0], us[1]

@@ -419,6 +419,7 @@ def _find_hdf5_reader(path: Path, options: ReadOptions) -> Reader:
         is_ours = isinstance(events, h5py.Group) and {"t", "x", "y", "p"} <= set(events)
         is_ours |= str(hdf5_files.attribute(file, "format")) == "jaxevent"
         is_other = not is_ours and hdf5_layouts.is_known(file)
+        held = "" if is_ours or is_other else hdf5_files.describe_datasets(file)
         with path.open("rb") as stored:  # MATLAB puts 512 bytes of its own before HDF5
             is_matlab = stored.read(6) == b"MATLAB"
     if is_other and not is_matlab:
@@ -432,7 +433,8 @@ def _find_hdf5_reader(path: Path, options: ReadOptions) -> Reader:
         return hdf5.read
     raise InputError(
         f"{path}: the HDF5 file has neither events/t, x, y and p nor events under other known "
-        f"names; {_READABLE_FORMATS}"
+        f"names; it holds {held}; read its columns with h5py and give them to "
+        "jaxevent.Recording.from_arrays(t, x, y, p, width=..., height=...)"
     )
 
 

@@ -125,6 +125,11 @@ def reading(source: object) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
+        if isinstance(error, OSError) and error.filename is not None:
+            place = "" if str(error.filename) in str(source) else f": {error.filename}"
+            raise InputError(
+                f"{source}: cannot be read ({error.strerror}{place}); check the path"
+            ) from error
         reason = " ".join(str(error).split()) or type(error).__name__
         reason = reason if len(reason) < 200 else reason[:200] + "..."
         raise InputError(
@@ -433,5 +438,5 @@ def images_folder(path: Path) -> Path | None:
 
 
 def _existing(path: Path, name: str) -> Path | None:
-    other = path.with_name(name)
+    other = path.parent / name
     return other if name != path.name and other.is_file() else None

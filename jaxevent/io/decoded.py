@@ -23,7 +23,7 @@ from jaxevent.errors import InputError, OrderError
 from jaxevent.io import disorder
 from jaxevent.io.checks import ReadOptions, check_events, reading
 from jaxevent.progress import bar
-from jaxevent.recording import Events, EventSource, Recording, Triggers
+from jaxevent.recording import Events, EventSource, Recording, Triggers, slice_bounds
 from jaxevent.threads import TurnLock, synchronized
 
 BLOCK_EVENTS = 1 << 20  # events decoded together: 13 MB
@@ -420,25 +420,6 @@ class DecodedEvents(EventsInFile):
         if len(self._recent) > 3:
             self._recent = {number: events}
         return events
-
-
-def slice_bounds(rows: slice, count: int) -> tuple[int, int]:
-    """Return the bounds of a slice of events.
-
-    Args:
-        rows: The slice, of step 1.
-        count: Number of events.
-
-    Returns:
-        First row, and the row after the last one.
-
-    Raises:
-        ValueError: The step is another.
-    """
-    start, stop, step = rows.indices(count)
-    if step != 1:
-        raise ValueError("events in a file are read as a range of rows, events[i:j], step 1")
-    return start, stop
 
 
 def _changed_file_error(source: str, what: str) -> InputError:

@@ -53,7 +53,7 @@ from jaxevent.io.checks import (
     whole_size,
 )
 from jaxevent.io.columns import MICROSECOND_FORMAT, ColumnFormat, infer_format, sample_ends
-from jaxevent.io.decoded import EventsInFile, ImagesInFile, read_events, slice_bounds
+from jaxevent.io.decoded import EventsInFile, ImagesInFile, read_events
 from jaxevent.io.disorder import Columns, find_disorder
 from jaxevent.io.hdf5_files import (
     array,
@@ -75,6 +75,7 @@ from jaxevent.recording import (
     Poses,
     Recording,
     Triggers,
+    slice_bounds,
 )
 from jaxevent.time_units import Clock, unit_of_words
 

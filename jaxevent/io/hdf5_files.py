@@ -72,6 +72,28 @@ def open_file(path: Path) -> h5py.File:
         return file
 
 
+def describe_datasets(file: Any, most: int = 8) -> str:
+    """Describe the datasets of a file for messages, as "a/t int64 (10,), a/x int16 (10,)".
+
+    Args:
+        file: The open file, of h5py.
+        most: Number of datasets from which the others are counted only.
+
+    Returns:
+        Their names, types and shapes, or "no dataset".
+    """
+    found: list[str] = []
+
+    def note(name: str, thing: Any) -> None:
+        if isinstance(thing, h5py.Dataset):
+            text = f"{name} {thing.dtype} {thing.shape}"
+            found.append(" ".join(text.split())[:60])
+
+    file.visititems(note)
+    more = [f"{len(found) - most:,} more"] if len(found) > most else []
+    return ", ".join(found[:most] + more) or "no dataset"
+
+
 def attribute(of: Any, name: str) -> Any:
     """Read an attribute.
 

@@ -271,7 +271,7 @@ def _read_hdf5_series(path: Path, scale: Scale) -> Series:
             f"{path}: image has the shape {stored.shape} and t {t.shape}; store one time for "
             "each image"
         )
-    times = microseconds(t[()], f"{path}: t")
+    times = microseconds(t[()], f"{path}: the times t")
     return _make_series(
         (times, np.zeros_like(times)), lambda row: stored[row], str(path), (path,), scale
     )

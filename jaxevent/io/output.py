@@ -91,7 +91,7 @@ def check_outputs(
                 _check_against(out, one)
         if out in inside:
             continue
-        if out.is_file() and not force:
+        if (out.is_file() or (out.is_symlink() and not out.is_dir())) and not force:
             raise InputError(f"{out}: exists; choose another name, or replace it with --force")
         if out.is_dir() and not force and any(out.iterdir()):
             raise InputError(
@@ -394,10 +394,10 @@ def check_writable(path: Path, directory: bool = False) -> None:
 
 
 def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
             path.unlink()
 
 

@@ -20,7 +20,7 @@ from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.events.live import Tail
 from jaxevent.reconstruction.video import NEVER_US, PixelMethod, Video, note_first_events
-from jaxevent.recording import Events, Frames, Recording, Times, microseconds
+from jaxevent.recording import Events, Frames, Recording, Times, microseconds, one_time
 from jaxevent.threads import TurnLock, refuse_to_pickle, synchronized
 
 MAX_WINDOW_EVENTS = 1 << 17  # filtered together, and at most so many anew for an image
@@ -142,9 +142,9 @@ class LiveVideo:
         """
         if not self._expects_frames:
             raise InputError("frames were not expected; make the live video with frames=True")
-        r, t = self._recording, int(microseconds(time))
+        r, t = self._recording, one_time(time)
         one = Frames(
-            np.array([t]), np.asarray(image)[None], np.array([int(microseconds(exposure))])
+            np.array([t]), np.asarray(image)[None], np.array([one_time(exposure, "the exposure")])
         )
         one.check(r.width, r.height, "the frame added")
         known = r.frames

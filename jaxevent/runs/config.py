@@ -239,6 +239,15 @@ def _with_unique_names(
 def _find_paths(text: str, folder: Path) -> dict[Path, str]:
     """Find the paths that a text of a configuration stands for, and the name of each."""
     expanded = os.path.expanduser(os.path.expandvars(text))
+    try:
+        os.stat(folder / expanded)
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError) as error:  # too long, or with a character that no path has
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(
+            f"the recording {text[:60]!r} cannot be read ({reason}); correct the path"
+        ) from None
     unset = re.search(r"\$(\w+|\{[^}]*\})", expanded)
     if unset and not (folder / expanded).exists():
         name = unset.group(1).strip("{}")

@@ -18,7 +18,7 @@ from jaxevent.io.output import CLOCK_UNIT, complete, complete_hdf5, deflate_shuf
 from jaxevent.progress import bar
 from jaxevent.reconstruction.colour import apply_chrominance, chrominance, luminance
 from jaxevent.reconstruction.video import N_BATCH_IMAGES, ImageSequence
-from jaxevent.recording import Recording, Times, microseconds
+from jaxevent.recording import Recording, Times, microseconds, one_time
 from jaxevent.show.images import Tone, display_limits, encode_png, tone_map, video_writer
 
 MAX_IMAGES = 10_000_000  # times of one command: 80 MB, a day of 100 per second
@@ -51,10 +51,10 @@ def image_times(
         )
     first = recording.start
     if start is not None:
-        first = max(first, int(microseconds(float(start), "--start")))
+        first = max(first, one_time(float(start), "--start"))
     last = recording.stop
     if stop is not None:
-        last = min(last, int(microseconds(float(stop), "--stop")))
+        last = min(last, one_time(float(stop), "--stop"))
     count = max(0, math.floor((last - first) * rate / 1e6 + 1e-9) + 1)
     if count > MAX_IMAGES:
         raise InputError(
@@ -79,8 +79,8 @@ def within(
     Raises:
         InputError: There are none.
     """
-    first = -np.inf if start is None else microseconds(float(start), "--start")
-    end = np.inf if stop is None else microseconds(float(stop), "--stop")
+    first = -np.inf if start is None else one_time(float(start), "--start")
+    end = np.inf if stop is None else one_time(float(stop), "--stop")
     chosen = times[(times >= first) & (times < end)]
     if not len(chosen):
         span = f"from {format_span(times)}" if len(times) else "none"
@@ -251,7 +251,8 @@ def _write_video(video: ImageSequence, times: NDArray, out: Path, options: Expor
     Returns:
         The end of a sentence about the file.
     """
-    rate = (len(times) - 1) / ((times[-1] - times[0]) / 1e6) if len(times) > 1 else 25.0
+    seconds = (times[-1] - times[0]) / 1e6
+    rate = (len(times) - 1) / seconds if seconds > 0 else 25.0
     fps = min(rate, 60.0)
     range_used = RangeCounter(options.tone)
     with video_writer(out, fps) as write:

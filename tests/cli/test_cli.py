@@ -177,6 +177,8 @@ def test_bad_ways_to_reconstruct(folder, capsys):
         fails(capsys, argv, path, "no colour frames")
     for name in ("out.avi", "out.h5.gz"):
         fails(capsys, ["reconstruct", path, *blend[:2], "--out", folder / name], folder / name)
+    for bound in ("--start", "--stop"):
+        fails(capsys, ["reconstruct", path, *blend, bound, "nan"], f"{bound} is nan; give one")
     fails(capsys, ["reconstruct", path, *blend[:2], "--out", "."])
     fails(capsys, ["reconstruct", path, *blend[:2], "--out", folder], folder, "holds the input")
     assert sorted(folder.rglob("*")) == before

@@ -47,6 +47,8 @@ def test_what_cannot_be_filtered(stored, tmp_path, capsys):
     fails(capsys, ["filter", source, target], source, "no filter is given", "--hot-pixels")
     fails(capsys, ["filter", source, target, "--crop", 0, 0, 500, 2], "500x2", "not inside")
     fails(capsys, ["filter", source, target, "--background", 0], "is 0 us")
+    fails(capsys, ["filter", source, target, "--downsample", 0], "0x0", "whole number from 1")
+    fails(capsys, ["filter", source, target, "--start", "nan"], "the start is nan")
     fails(capsys, ["filter", source, target, "--start", 90], source, "no event")
     assert not target.exists()
 

@@ -466,7 +466,8 @@ def test_bad_input_is_said_before_the_work(folder, capsys):
     fails(capsys, ["motion", folder / "none.h5", *model, *to], "none.h5")
     fails(capsys, ["motion", folder / "empty.h5", *model, *to], "empty.h5", "no events")
     fails(capsys, ["motion", planar, "--model", "planer", *to], "did you mean 'planar'")
-    fails(capsys, ["motion", planar, *model, "--method", "vote", *to], "'vote'", "voting")
+    for given in (model, []):
+        fails(capsys, ["motion", planar, *given, "--method", "vote", *to], "'vote'", "voting")
     general = ["--model", "general", "--method", "planes"]
     fails(capsys, ["motion", planar, *general, *to], "'planes'", "planar and rotation")
     fails(capsys, ["motion", folder / "bare.h5", "--model", "rotation", *to], "no calibration")

@@ -238,6 +238,35 @@ def test_a_missing_folder_is_told_before_anything_is_read(name, folder, capsys, 
     fails(capsys, argv, "missing/a.h5: cannot be written (No such file or directory)")
 
 
+def test_names_that_no_file_can_have_are_told(folder, capsys):
+    before = state(folder)
+    fails(capsys, ["convert", "source.h5", "x" * 300 + ".h5"], "File name too long")
+    fails(capsys, ["info", "x" * 300 + ".h5"], "File name too long")
+    use = ["reconstruct", "source.h5", "--method", "akf", "--out", "a.h5"]
+    fails(capsys, [*use, "--params", "."], ".: cannot be read (Is a directory)")
+    fails(
+        capsys,
+        [*use, "--times", "nofile"],
+        "nofile: cannot be read (No such file",
+        "check the path",
+    )
+    assert state(folder) == before
+
+
+def test_a_link_to_nothing_is_kept(folder, capsys):
+    (folder / "a.h5").symlink_to("nothing.h5")
+    fails(capsys, ["convert", "source.h5", "a.h5"], "a.h5: exists")
+    assert (folder / "a.h5").is_symlink()
+    assert cli.main(["convert", "source.h5", "a.h5", "--force"]) == 0
+
+
+def test_a_working_folder_that_is_gone_is_told(folder, capsys, monkeypatch):
+    (folder / "gone").mkdir()
+    monkeypatch.chdir(folder / "gone")
+    (folder / "gone").rmdir()
+    fails(capsys, ["convert", folder / "source.h5", "a.h5"], "working folder is no longer there")
+
+
 @pytest.mark.parametrize("more", [[], ["--force"]])
 def test_an_output_is_claimed_before_the_work_begins(more, folder, capsys, monkeypatch):
     """A command that begins while another one reads its input does not write the same output."""

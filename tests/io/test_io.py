@@ -763,7 +763,14 @@ def test_load_refuses_other_things(tmp_path):
     refuses("neither events.txt nor .npy arrays", load, other)
     with File(other, "w") as file:
         file["data"] = 1
-    refuses("neither events/t, x, y and p nor", load, other)
+    refuses(r"neither events/t, x, y and p nor .* it holds data int64 \(\); read", load, other)
+    with File(other, "w") as file:
+        for number in range(12):
+            file[f"some/{number:02}"] = np.zeros((3, 2), np.int16)
+    refuses(r"holds some/00 int16 \(3, 2\), some/01 .*, 4 more; read .*from_arrays", load, other)
+    with File(other, "w"):
+        pass
+    refuses("it holds no dataset; read", load, other)
     refuses("two positive numbers of pixels", load, other, size=(0, 5))
 
 

@@ -182,6 +182,8 @@ def test_results_of_a_configuration(folder, monkeypatch, float32):
         (ONE + "params = { c_on = -1 }", "c_on is -1"),
         (ONE + '[[method]]\nname = "bland"', "method 2: .*'bland'; did you mean 'blend'"),
         (ONE.replace("small", "*"), "no recording matches '.*npz'"),
+        (ONE.replace("small", "a\\u0000b"), "cannot be read .*null.*; correct the path"),
+        (ONE.replace("small", "x" * 300), r"cannot be read \(File name too long\); correct"),
         (ONE.replace("small", "$NOT_SET/a"), "needs the variable NOT_SET, which is not set"),
         (ONE.replace("small", "${NOT_SET}/a"), "needs the variable NOT_SET, which is not set"),
         ("recordings = [", "is not TOML"),

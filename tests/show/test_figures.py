@@ -97,6 +97,13 @@ def test_an_image_and_its_uncertainty():
     assert all(axis.patch.get_hatch() for axis in figure.axes[:2])
 
 
+def test_a_video_of_one_time_twice_has_a_rate(tmp_path):
+    pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
+    video = jaxevent.blend.estimate(small())
+    show.save_video(video, video.recording.frames.t[[0, 0]], tmp_path / "still.mp4")
+    assert (tmp_path / "still.mp4").is_file()
+
+
 def test_a_video_is_saved_by_the_kind_of_its_name(tmp_path):
     video = jaxevent.blend.estimate(small())
     t = video.recording.frames.t[:2]
