@@ -8,11 +8,12 @@ configs/fit_ahdr.toml, gives the smoother's numbers to mc, and scores all on the
 the true HDR images. Errors are geometric means over test recordings; after +- is the standard
 deviation over the seeds of such a mean, in per cent. Done parts are kept in the folder and not
 repeated. With --methods only those are fitted and scored, and nothing is fitted where none is
-tunable. The tables are those of all recordings, of slow and of fast ones, and the calibration of
-each scene. Where ColorVideoVDP is installed (pip install '.[hdr]'), they have its quality Q too, of
-every sixth image. "Outside" are pixels brighter or darker than frames see; "levels" is the
-part of their log MSE that the right mean of each connected region would take away. With --known
-the simulated sensor's own numbers take the place of fitted ones.
+tunable. A fit that the folder holds is kept; one that lacks a method is refused. The tables are
+those of all recordings, of slow and of fast ones, and the calibration of each scene. Where
+ColorVideoVDP is installed (pip install '.[hdr]'), they have its quality Q too, of every sixth
+image. "Outside" are pixels brighter or darker than frames see; "levels" is the part of their log
+MSE that the right mean of each connected region would take away. With --known the simulated
+sensor's own numbers take the place of fitted ones.
 """
 
 import importlib.util
@@ -232,24 +233,28 @@ def main() -> None:
     parser.add_argument("--known", action="store_true", help="thresholds etc. of the sensor itself")
     arguments = parser.parse_args()
     out = arguments.out.absolute()
-    paths = record(out / "test", TESTING_SCENES, range(2, 2 + arguments.seeds), arguments.sensor)
     fitted = out / "fitted"
+    file = fitted / "params.toml"
     wanted = {*arguments.methods, *({"aks"} if "mc" in arguments.methods else ())}
     plan = read_toml(CONFIG)
     plan["method"] = [m for m in plan["method"] if m.get("label", m["name"]) in wanted]
-    if plan["method"] and not (fitted / "params.toml").exists():
+    tunable = [m.get("label", m["name"]) for m in plan["method"]]
+    known = read_toml(file) if file.exists() else tunable
+    if missing := [label for label in tunable if label not in known]:
+        parser.error(
+            f"{file} has no parameters of {'; '.join(missing)}: give another --out, or remove "
+            f"{fitted}, so that all are fitted"
+        )
+    paths = record(out / "test", TESTING_SCENES, range(2, 2 + arguments.seeds), arguments.sensor)
+    if plan["method"] and not file.exists():
         record(out / "fit", FITTING_SCENES, range(1), arguments.sensor)
         record(out / "validation", FITTING_SCENES, range(1, 2), arguments.sensor)
         os.environ["AHDR"] = str(out)
         config = out / "fit.toml"
         config.write_text(toml.dump(plan))
         fit(config, fitted, resume=(fitted / "checkpoint").exists(), progress=sys.stderr.isatty())
-    rows = rows_of(
-        paths,
-        choose(arguments.methods, fitted / "params.toml"),
-        out / "scores.json",
-        arguments.known,
-    )
+    methods = choose(arguments.methods, file)
+    rows = rows_of(paths, methods, out / "scores.json", arguments.known)
     text = table(rows)
     for speed in SECONDS:
         own = [row for row in rows if f"_{speed}_" in row["recording"]]
