@@ -159,8 +159,9 @@ class Settings:
 
     A round searches all searched parameters, then takes `iterations` steps of Adam. The learning
     rate falls along a cosine from `learning_rate`, which is halved with every round, to a tenth of
-    it. Every `every` iterations the validation loss is computed; a start that has not improved for
-    `patience` iterations stops. The result is the best point evaluated, with parameters within
+    it. Every `every` iterations batches are prepared anew, if a function of the parameters prepares
+    them, and the validation loss is computed; a start that has not improved for `patience`
+    iterations stops. The result is the best point evaluated, with parameters within
     their bounds. `starts` starting points are optimised at once: the given one, and others drawn
     around it with a standard deviation of `spread` in the unconstrained numbers. A step uses
     `batch` batches, drawn without replacement; None uses all. `forward` chooses forward or reverse
@@ -206,6 +207,7 @@ class Position(eqx.Module):
     best_loss: Float[Array, " starts"]
     best_at: Int[Array, " starts"]  # iteration of the best loss
     searched: dict[str, Array]  # searched parameters, common to all starts, unconstrained
+    prepared: dict[str, Array]  # `raw` of the one start that batches were prepared with
 
 
 @dataclasses.dataclass
@@ -313,6 +315,7 @@ def begin(
         jnp.full(settings.starts, jnp.inf, dtype),
         jnp.zeros(settings.starts, int),
         {name: params.raw[name] for name in search},
+        {name: leaf[0] for name, leaf in raw.items()},
     )
     return Run(position)
 
@@ -341,7 +344,8 @@ def optimise(
             not predict its changes; the AKF's loss jumps with `ratio_width = 0`.
         batches: Pytrees, one compilation for each shape. A batch with an attribute `weight` counts
             that much in means over batches. Or a function `prepare(params)` that returns batches to
-            fit to and batches to validate on, for parameters that act when batches are made. With
+            fit to and batches to validate on, for parameters that act when batches are made; it is
+            called with the best start's parameters whenever the validation loss is computed. With
             several processes (`processes.join`) all pass the same list and each computes its share;
             a function returns `processes.REMOTE_BATCH` for batches that others compute.
         validation: Batches for early stopping, if `batches` is a list; without any, the fit's.
@@ -815,7 +819,9 @@ class _Loop:
         if not position.raw:
             return
         params = self.params.with_raw(position.searched)
-        fit, watched = self.prepare(params)[0], self.watched(params)
+        fit, validation = [], []
+        if run.iteration % settings.every:  # resumed
+            fit, validation = self.prepare(params.with_raw(position.prepared))
         if run.iteration == 0:
             worst = jnp.full_like(position.best_loss, jnp.inf)
             memory = jax.vmap(ADAM_TRANSFORM.init)(position.raw)
@@ -823,8 +829,12 @@ class _Loop:
         while True:
             i, seen = run.iteration, None
             if i % settings.every == 0 or i == settings.iterations:
+                leader = int(jnp.argmin(position.best_loss))
+                prepared = {name: leaf[leader] for name, leaf in position.raw.items()}
+                position = dataclasses.replace(position, prepared=prepared)
+                fit, validation = self.prepare(params.with_raw(prepared))
                 objective = functools.partial(_compute_losses, self.function, params, position.raw)
-                seen = _weighted_mean(objective, watched)
+                seen = _weighted_mean(objective, validation or fit)
                 position, going = _update_best(position, seen, i, settings.patience)
                 if i == settings.iterations or not bool(going):
                     self._record(turn, i, None, seen)

@@ -217,7 +217,7 @@ class ImageEstimator(Estimator[P]):
             params: Parameters.
 
         Returns:
-            Their values; without the numbers that a fit follows by gradient.
+            Their values.
         """
         return EventTiming.of(params)
 

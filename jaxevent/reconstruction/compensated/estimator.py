@@ -374,8 +374,8 @@ class MotionCompensation(ImageEstimator[Params]):
     )
 
     def preparation_key(self, params: Params) -> Hashable:
-        numbers = {name: float(getattr(params, name)) for name in params.names_without_gradient()}
-        return EventTiming.of(params), *numbers.values()
+        # Motion is estimated with all of them.
+        return tuple(np.asarray(leaf).tobytes() for leaf in params.raw.values())
 
     def prepare(
         self,

@@ -29,7 +29,6 @@ from jaxevent.reconstruction.events_only.video import (
 )
 from jaxevent.reconstruction.events_only.windows import SolvedWindow, WindowSolver
 from jaxevent.reconstruction.features import Numeric
-from jaxevent.reconstruction.frames import EventTiming
 from jaxevent.recording import Recording, Times
 
 HELD_OUT_STEP = 5  # one of so many events is predicted by the others
@@ -89,8 +88,8 @@ class EventsOnly(ImageEstimator[Params]):
     )
 
     def preparation_key(self, params: Params) -> Hashable:
-        numbers = {name: float(getattr(params, name)) for name in params.names_without_gradient()}
-        return EventTiming.of(params), *numbers.values()
+        # Motion is estimated with all of them.
+        return tuple(np.asarray(leaf).tobytes() for leaf in params.raw.values())
 
     def prepare(
         self,
