@@ -382,7 +382,8 @@ def optimise(
             run.stage, run.iteration, run.tried = run.stage + 1, 0, []
             loop.save(run, True)
         fitted = loop.best_params()
-        least = loop.loss(fitted, loop.watched(fitted))
+        batches, validation = prepare(fitted)
+        least = loop.loss(fitted, validation or batches)
         return FitResult(fitted, least, run.history, run.rough)
 
 
@@ -683,10 +684,6 @@ class _Loop:
         best = int(jnp.argmin(position.best_loss))
         raw = {name: leaf[best] for name, leaf in position.raw.items()}
         return self.params.with_raw({**raw, **position.searched})
-
-    def watched(self, params: Any) -> Sequence[Any]:
-        fit, validation = self.prepare(params)
-        return validation or fit
 
     def loss(self, params: Any, batches: Sequence[Any]) -> float:
         names = list(self.run.position.raw)

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
 from jaxevent import codegen, threads
+from jaxevent.cache import ByValue
 from jaxevent.codegen import map_ahead
 from jaxevent.deprecated import RenamedAttribute, renamed_names
 from jaxevent.errors import InputError
@@ -374,8 +375,7 @@ class MotionCompensation(ImageEstimator[Params]):
     )
 
     def preparation_key(self, params: Params) -> Hashable:
-        # Motion is estimated with all of them.
-        return tuple(np.asarray(leaf).tobytes() for leaf in params.raw.values())
+        return ByValue(params.raw)  # motion is estimated with all of them
 
     def prepare(
         self,
@@ -414,14 +414,13 @@ class MotionCompensation(ImageEstimator[Params]):
         size = (recording.height, recording.width)
         own = np.arange(recording.height * recording.width, dtype=np.int32).reshape(size)
         noise = trajectories.event_noise
-        n_intervals = max(len(noise.locate(one.t).between_frames()) for one in chosen)
-        targets = []
-        for t in wanted.tolist():
+        between = [noise.locate(one.t).between_frames() for one in chosen]
+        n_intervals, targets = max(len(one) for one in between), []
+        for t, intervals in zip(wanted.tolist(), between, strict=True):
             target = trajectories(t)
             one, rows = target.instants, np.zeros(count, np.int32)
             rows[: len(one)] = np.searchsorted(every, one.t)
             positions = noise.locate(every[rows])
-            intervals = noise.locate(one.t).between_frames()
             intervals = np.resize(intervals, n_intervals)
             noise_rows = (positions.interval[:, None] == intervals).argmax(1).astype(np.int32)
             path_index = own if target.path_index is None else target.path_index

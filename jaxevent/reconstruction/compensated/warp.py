@@ -95,22 +95,6 @@ def gradient_at_pixel(image, y, x):
     return gx * twelfth, gy * twelfth
 
 
-def pad_edges(images: Array, axis: int, n_pixels: int) -> Array:
-    """Pad images by copies of the border.
-
-    Args:
-        images: Images.
-        axis: The axis that becomes longer.
-        n_pixels: Copies at each of its ends.
-
-    Returns:
-        The padded images.
-    """
-    widths = [(0, 0)] * images.ndim
-    widths[axis] = (n_pixels, n_pixels)
-    return jnp.pad(images, widths, mode="edge")
-
-
 @functools.cache
 def _filter_matrix(size: int, taps: tuple[float, ...]) -> NDArray[np.float64]:
     """Make the matrix that filters along an axis; see `filter_along`.

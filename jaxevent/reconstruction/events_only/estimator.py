@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
+from jaxevent.cache import ByValue
 from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate, ShortRepr
 from jaxevent.reconstruction.estimator import ImageEstimator
@@ -88,8 +89,7 @@ class EventsOnly(ImageEstimator[Params]):
     )
 
     def preparation_key(self, params: Params) -> Hashable:
-        # Motion is estimated with all of them.
-        return tuple(np.asarray(leaf).tobytes() for leaf in params.raw.values())
+        return ByValue(params.raw)  # motion is estimated with all of them
 
     def prepare(
         self,
