@@ -77,7 +77,7 @@ MEASURE_MEANINGS = {
     "theta": "root mean square error of the orientation",
     "inverse_ttc": "root mean square error of the inverse time to contact",
     "range": "root mean square error of the range, of its size",
-    "nll": "mean negative log-likelihood of an event, nats; less is better",
+    "nll": "mean negative log-likelihood of an event or a pixel, nats; less is better",
     "times": "times that were compared",
     "windows": "segments of the recordings that were compared",
     "events": "events in them",

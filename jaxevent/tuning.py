@@ -161,9 +161,12 @@ class Settings:
     rate falls along a cosine from `learning_rate`, which is halved with every round, to a tenth of
     it. Every `every` iterations batches are prepared anew, if a function of the parameters prepares
     them, and the validation loss is computed; a start that has not improved for `patience`
-    iterations stops. The result is the best point evaluated, with parameters within
-    their bounds. `starts` starting points are optimised at once: the given one, and others drawn
-    around it with a standard deviation of `spread` in the unconstrained numbers. A step uses
+    iterations stops. If the fit loss of batches prepared anew is greater than it was `every`
+    iterations before, what preparation fixes, such as motion, has become worse: the start returns
+    to where it was then, and its learning rate is halved. The result is the best point evaluated,
+    with parameters within their bounds. `starts` starting points are optimised at once: the given
+    one, and others drawn around it with a standard deviation of `spread` in the unconstrained
+    numbers. A step uses
     `batch` batches, drawn without replacement; None uses all. `forward` chooses forward or reverse
     differentiation; None takes the faster. With `probe` the loss is probed before the first step:
     numbers whose gradient does not predict how the loss changes (`gradient_skill`) are searched
@@ -208,6 +211,9 @@ class Position(eqx.Module):
     best_at: Int[Array, " starts"]  # iteration of the best loss
     searched: dict[str, Array]  # searched parameters, common to all starts, unconstrained
     prepared: dict[str, Array]  # `raw` of the one start that batches were prepared with
+    kept: dict[str, Array]  # `raw` when batches were last prepared anew
+    kept_loss: Float[Array, " starts"]  # fit loss of `kept` with these batches
+    rate: Float[Array, " starts"]  # factor on the learning rate
 
 
 @dataclasses.dataclass
@@ -316,6 +322,9 @@ def begin(
         jnp.zeros(settings.starts, int),
         {name: params.raw[name] for name in search},
         {name: leaf[0] for name, leaf in raw.items()},
+        raw,
+        jnp.full(settings.starts, jnp.inf, dtype),
+        jnp.ones(settings.starts, dtype),
     )
     return Run(position)
 
@@ -540,6 +549,35 @@ def loss_and_grad(
 
 
 @jax.jit
+def _keep_or_return(position: Position, loss: Array) -> tuple[Position, Array]:
+    """Keep where each start is, or return it to where it was, at half its learning rate.
+
+    Args:
+        position: State of the fit.
+        loss: (starts,) fit losses with batches prepared anew.
+
+    Returns:
+        The state, and which starts returned, (starts,).
+    """
+    returned = ~(loss <= position.kept_loss)
+
+    def choose(old: Array, new: Array) -> Array:
+        return jnp.where(returned.reshape(-1, *[1] * (new.ndim - 1)), old, new)
+
+    raw = jax.tree.map(choose, position.kept, position.raw)
+    memory = jax.vmap(ADAM_TRANSFORM.init)(raw)
+    kept = dataclasses.replace(
+        position,
+        raw=raw,
+        kept=raw,
+        kept_loss=choose(position.kept_loss, loss),
+        optimiser=jax.tree.map(choose, memory, position.optimiser),
+        rate=position.rate * jnp.where(returned, 0.5, 1),
+    )
+    return kept, returned
+
+
+@jax.jit
 def _adam_step(position: Position, slope: dict[str, Array], rate: float | Array) -> Position:
     """Take a step of Adam from each start.
 
@@ -553,7 +591,11 @@ def _adam_step(position: Position, slope: dict[str, Array], rate: float | Array)
     """
     update: Any = jax.vmap(ADAM_TRANSFORM.update)
     direction, memory = update(slope, position.optimiser)
-    raw = {name: leaf - rate * direction[name] for name, leaf in position.raw.items()}
+    rates = rate * position.rate
+    raw = {
+        name: leaf - rates.reshape(-1, *[1] * (leaf.ndim - 1)) * direction[name]
+        for name, leaf in position.raw.items()
+    }
     return dataclasses.replace(position, raw=raw, optimiser=memory)
 
 
@@ -752,15 +794,22 @@ class _Loop:
         def moved(names: Sequence[str], step: float) -> dict[str, Array]:
             return {n: leaf + step * units[n] if n in names else leaf for n, leaf in raw.items()}
 
-        def loss(names: Sequence[str], step: float) -> float:
-            at = moved(names, step)
+        def loss(
+            names: Sequence[str], step: float, batches_at: Callable[[Any], Sequence[Any]]
+        ) -> float:
             value = next(replay, None)
             if value is None:
+                at = moved(names, step)
+                chosen = batches_at({name: leaf[0] for name, leaf in at.items()})
                 function = functools.partial(_compute_losses, self.function, params, at)
-                value = float(_weighted_mean(function, batches)[0])
+                value = float(_weighted_mean(function, chosen)[0])
                 value = value if math.isfinite(value) else math.inf
                 self._log_tried(value)
             return value
+
+        def prepare_anew(one: dict[str, Array]) -> Sequence[Any]:
+            anew = self.prepare(params.with_raw(one))[0]
+            return [anew[k] for k in self._draw_batches(len(anew))]
 
         def gradient_along(names: Sequence[str], step: float) -> list[float]:
             at = moved(names, step)
@@ -774,7 +823,7 @@ class _Loop:
             return found
 
         def probe(names: Sequence[str]) -> tuple[list[float], list[float], NDArray[np.float64]]:
-            losses = {step: loss(names, step) for step in PROBE_STEPS}
+            losses = {step: loss(names, step, lambda _: batches) for step in PROBE_STEPS}
             steps = [step for step, value in losses.items() if math.isfinite(value)]
             table = np.array([gradient_along(names, step) for step in steps])
             return steps, [losses[step] for step in steps], table
@@ -793,7 +842,8 @@ class _Loop:
                 found = gradient_skill(steps, losses, table[:, 0])
             if found >= MIN_SKILL:
                 continue
-            step = _search_smoothed(functools.partial(loss, [name]))
+            objective = functools.partial(loss, [name], batches_at=prepare_anew)
+            step = _search_smoothed(objective)
             raw[name] = moved([name], step)[name]
             value = float(params.numbers[name].physical(raw[name].mean()))
             self.run.rough[name] = RoughNumber(found, value)
@@ -817,19 +867,22 @@ class _Loop:
             return
         params = self.params.with_raw(position.searched)
         fit, validation = [], []
-        if run.iteration % settings.every:  # resumed
+        if run.iteration:  # resumed
             fit, validation = self.prepare(params.with_raw(position.prepared))
-        if run.iteration == 0:
+        else:
             worst = jnp.full_like(position.best_loss, jnp.inf)
-            memory = jax.vmap(ADAM_TRANSFORM.init)(position.raw)
-            position = dataclasses.replace(position, optimiser=memory, best_loss=worst)
+            position = dataclasses.replace(
+                position,
+                optimiser=jax.vmap(ADAM_TRANSFORM.init)(position.raw),
+                best_loss=worst,
+                kept=position.raw,
+                kept_loss=worst,
+                rate=jnp.ones_like(worst),
+            )
         while True:
             i, seen = run.iteration, None
             if i % settings.every == 0 or i == settings.iterations:
-                leader = int(jnp.argmin(position.best_loss))
-                prepared = {name: leaf[leader] for name, leaf in position.raw.items()}
-                position = dataclasses.replace(position, prepared=prepared)
-                fit, validation = self.prepare(params.with_raw(prepared))
+                position, (fit, validation) = self._prepare_anew(params, position, fit)
                 objective = functools.partial(_compute_losses, self.function, params, position.raw)
                 seen = _weighted_mean(objective, validation or fit)
                 position, going = _update_best(position, seen, i, settings.patience)
@@ -850,6 +903,34 @@ class _Loop:
             self.bar.set_postfix(loss=f"{float(jnp.min(losses)):.5g}")
             self.save(run, False)
         run.position = dataclasses.replace(position, raw=position.best)
+
+    def _prepare_anew(
+        self, params: Any, position: Position, before: Sequence[Any]
+    ) -> tuple[Position, Batches]:
+        """Prepare batches with the best start; starts whose fit loss has grown return.
+
+        Args:
+            params: Parameters; those in `position.raw` are replaced.
+            position: The state of the fit.
+            before: Batches that the steps since the last preparation were taken with.
+
+        Returns:
+            The state, and the batches to fit to and to validate on.
+        """
+        leader = int(jnp.argmin(position.best_loss))
+
+        def prepare() -> Batches:
+            prepared = {name: leaf[leader] for name, leaf in position.raw.items()}
+            return self.prepare(params.with_raw(prepared))
+
+        batches = prepare()
+        if batches[0] is not before:
+            objective = functools.partial(_compute_losses, self.function, params, position.raw)
+            position, returned = _keep_or_return(position, _weighted_mean(objective, batches[0]))
+            if returned[leader]:
+                batches = prepare()
+        prepared = {name: leaf[leader] for name, leaf in position.raw.items()}
+        return dataclasses.replace(position, prepared=prepared), batches
 
     def _draw_batches(self, count: int) -> Sequence[int]:
         """Return the indices of this iteration's batches, the next of successive permutations."""

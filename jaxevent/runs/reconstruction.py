@@ -43,11 +43,12 @@ from jaxevent.runs.protocols import (
     is_gap,
 )
 from jaxevent.runs.scores import HeldOut, ImageProtocol, score, subset
-from jaxevent.show.tables import Row, legend, markdown_table, results_table
+from jaxevent.show.tables import Column, Row, legend, markdown_table, results_table
 from jaxevent.tuning import Batches
 
 ERROR_KINDS = ("linear", "log", "nll")
 REGION_NAMES = ("dark", "well", "bright")
+LIKELIHOOD_COLUMNS: list[Column] = [("NLL", "nll", 1, 4)]
 
 
 class ImageBatch(eqx.Module):
@@ -424,6 +425,8 @@ class ImageGoal(Goal):
 
     @property
     def measure(self) -> str:
+        if self.loss.error == "nll":
+            return "nll"
         return "log_mse" if self.loss.error == "log" and self.protocol == "reference" else "mse"
 
     def calibrate(self, data: FitData, params: FrameParams, names: Sequence[str]) -> FrameParams:
@@ -470,7 +473,7 @@ class ImageGoal(Goal):
                     yield {**subset(row, np.flatnonzero(shared == place)), "split": name}
 
     def table(self, rows: Sequence[Row]) -> str:
-        return markdown_table(rows)
+        return markdown_table(rows, LIKELIHOOD_COLUMNS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -517,7 +520,7 @@ class EventGoal(Goal):
                 }
 
     def table(self, rows: Sequence[Row]) -> str:
-        columns = [("NLL", "nll", 1, 4), ("windows", "windows", 1, 0), ("events", "events", 1, 0)]
+        columns = [*LIKELIHOOD_COLUMNS, ("windows", "windows", 1, 0), ("events", "events", 1, 0)]
         return results_table(rows, columns) + legend(columns)
 
 

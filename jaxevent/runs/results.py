@@ -193,6 +193,7 @@ def open_results(folder: Path) -> Iterator[Write]:
         raise
 
 
+WORSE_REMARK = "The fit of {} made {} worse: keep the parameters from before, or fit to more data."
 INTERVAL_COLUMNS = ("method", "parameter", "start", "found", "95 % interval", "unit", "")
 MIN_TOLD_LOST_SHARE = 0.01  # of the time, lost beside what was lost before the fit
 INDEPENDENT_MEASUREMENTS = "measurements, taken as independent"
@@ -316,6 +317,10 @@ def format_findings(found: Sequence[Mapping[str, Any]], gained: Sequence[Mapping
         if after >= before + MIN_TOLD_LOST_SHARE:
             change += f", but {100 * after:.0f} % of the time is lost, {100 * before:.0f} % before"
         lines.append(f"\nGain of {one['method']}: {one['measure']} of {seen} {pair}{change}.\n")
+        if one["after"] > one["before"]:
+            lines.append(f"\n{WORSE_REMARK.format(one['method'], seen)}\n")
+        if one["after"] > one["before"]:
+            lines.append(f"\n{WORSE_REMARK.format(one['method'], seen)}\n")
     return "".join(lines)
 
 

@@ -171,9 +171,9 @@ def hidden_scores(
         grey = np.asarray(truth.images)[0]
         white = 1 if grey.dtype.kind == "f" else np.iinfo(grey.dtype).max
         unclipped = (grey > 0) & (grey < white)
-        z2, usable = _standardised(image.astype(np.float64), variance, true.astype(np.float64), I0)
-        for name, mean in (("z2", np.mean), ("z2_median", np.median)):
-            scores[name] = math.nan if broken else _mean_over(z2, unclipped & usable, mean)
+        judged = _judge_variance(image.astype(np.float64), variance, true.astype(np.float64), I0)
+        judged_scores = judged.scores(unclipped)
+        scores |= dict.fromkeys(judged_scores, math.nan) if broken else judged_scores
     if moving is not None:
         scores["moving"] = {
             "share": float(moving.mean()),
@@ -182,13 +182,36 @@ def hidden_scores(
     return scores
 
 
-def _standardised(
+class _JudgedVariance(NamedTuple):
+    """Errors of an image beside its variance.
+
+    Attributes:
+        z2: (height, width) squared errors of ln(I + I0) over the predicted variance.
+        nll: (height, width) -ln p(I) of the true intensity, nats.
+        usable: (height, width) mask of known variances.
+    """
+
+    z2: NDArray[np.float64]
+    nll: NDArray[np.float64]
+    usable: NDArray[np.bool_]
+
+    def scores(self, mask: NDArray[np.bool_]) -> Scores:
+        """Compute the scores of the variance over a mask (height, width)."""
+        where = mask & self.usable
+        return {
+            "z2": _mean_over(self.z2, where, np.mean),
+            "z2_median": _mean_over(self.z2, where, np.median),
+            "nll": _mean_over(self.nll, where, np.mean),
+        }
+
+
+def _judge_variance(
     image: NDArray[np.float64],
     variance: NDArray[np.floating],
     truth: NDArray[np.float64],
     I0: float,
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Compute squared errors of ln(I + I0) over the predicted variance.
+) -> _JudgedVariance:
+    """Compare the errors of ln(I + I0) with the predicted variance.
 
     Args:
         image: (height, width) intensity.
@@ -197,13 +220,16 @@ def _standardised(
         I0: Offset inside the logarithm.
 
     Returns:
-        The squared errors, and a mask of known variances.
+        The errors.
     """
     # L = ln(I + I0) cannot be known better than I is rounded.
     least = max(float(np.finfo(variance.dtype).eps) * I0, 1e-12)
     L, true_L = (np.log(np.maximum(part + I0, least)) for part in (image, truth))
     usable = np.isfinite(variance) & (variance > 0)
-    return (L - true_L) ** 2 / np.where(usable, variance, 1).astype(np.float64), usable
+    P = np.where(usable, variance, 1).astype(np.float64)
+    z2 = (L - true_L) ** 2 / P
+    # p(I) = N(ln(I + I0); L, P) / (I + I0)
+    return _JudgedVariance(z2, 0.5 * (z2 + np.log(2 * math.pi * P)) + true_L, usable)
 
 
 def _mean_over(values: NDArray, mask: NDArray[np.bool_], mean: Callable[[NDArray], Any]) -> float:
@@ -277,11 +303,10 @@ def _hdr_measures(
         for name, mask in masks.items()
     }
     if variance is not None:
-        z2, usable = _standardised(shown, variance, covered, I0)
-        scores["z2"] = _mean_over(z2, known & usable, np.mean)
-        scores["z2_median"] = _mean_over(z2, known & usable, np.median)
+        judged = _judge_variance(shown, variance, covered, I0)
+        scores |= judged.scores(known)
         for name, mask in masks.items():
-            parts[name]["z2"] = _mean_over(z2, mask & usable, np.mean)
+            parts[name]["z2"] = judged.scores(mask)["z2"]
     if broken:
         scores = dict.fromkeys(scores, math.nan)
         parts = {
@@ -429,7 +454,8 @@ def score(
 
     Where the method estimates a variance, `z2` is the mean of (error of ln(I + I0))^2 / variance,
     over all pixels, 1 for honest variances, and `z2_median` the mean over images of its median,
-    then 0.45 if errors are Gaussian. Black and clipped pixels of hidden frames do not count.
+    then 0.45 if errors are Gaussian. `nll` is the mean of -ln p of the true intensities, if
+    ln(I + I0) is Gaussian. Black and clipped pixels of hidden frames do not count.
 
     Rows of "reference" have also `log_mse` and `log_ssim`; `clip`, the bounds of the `regions`
     "bright", "dark" and "well"; and of each of those its `share` of all pixels and, over its pixels

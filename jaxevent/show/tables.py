@@ -67,10 +67,17 @@ COLUMNS: list[Column] = [
 COST_COLUMNS = {"frames", "missing", "seconds", "times"}  # columns that measure no quality
 
 
-def columns_of(rows: Sequence[Row]) -> list[Column]:
+def columns_of(rows: Sequence[Row], further: Sequence[Column] = ()) -> list[Column]:
     """Choose the columns of a table: those that rows have, and those of `REQUIRED_COLUMNS`.
 
     Metrics of the user's own, which rows name in `own_metrics`, follow the other measures.
+
+    Args:
+        rows: Rows of an evaluation.
+        further: Columns beside `COLUMNS`, before those of costs, where a row has them.
+
+    Returns:
+        The columns, in their order.
     """
     always = set() if any("per_time" in row for row in rows) else REQUIRED_COLUMNS
     known = [
@@ -79,8 +86,10 @@ def columns_of(rows: Sequence[Row]) -> list[Column]:
         if column[1] in always or any(nested_value(row, column[1]) is not None for row in rows)
     ]
     own = dict.fromkeys(name for row in rows for name in row.get("own_metrics", ()))
+    own_columns = [(name, name, 1, 4) for name in own]
+    beside = [c for c in further if any(nested_value(row, c[1]) is not None for row in rows)]
     work = next((i for i, column in enumerate(known) if column[1] in COST_COLUMNS), len(known))
-    return [*known[:work], *((name, name, 1, 4) for name in own), *known[work:]]
+    return [*known[:work], *beside, *own_columns, *known[work:]]
 
 
 def column_mean(rows: Sequence[Row], place: str) -> float | None:
@@ -117,18 +126,20 @@ def rows_of_method(rows: Sequence[Row], method: str, columns: Sequence[Column]) 
     ]
 
 
-def means(rows: Sequence[Row]) -> list[dict[str, Any]]:
+def means(rows: Sequence[Row], further: Sequence[Column] = ()) -> list[dict[str, Any]]:
     """Compute the means of each method over recordings.
 
     Args:
         rows: Rows of an evaluation; those with an error do not count.
+        further: Columns beside `COLUMNS`, where a row has them.
 
     Returns:
         For each method `method`, `recordings` (the number of rows that count) and the mean of each
         of `columns_of` by its place in a row; None where no row has the number.
     """
     done = [row for row in rows if "error" not in row]
-    columns = [column for column in columns_of(done) if column[1] not in ("frames", "missing")]
+    chosen = columns_of(done, further)
+    columns = [column for column in chosen if column[1] not in ("frames", "missing")]
     found = []
     for method in dict.fromkeys(row["method"] for row in rows):
         mine = rows_of_method(done, method, columns)
@@ -137,7 +148,7 @@ def means(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return found
 
 
-def markdown_table(rows: Iterable[Row]) -> str:
+def markdown_table(rows: Iterable[Row], further: Sequence[Column] = ()) -> str:
     """Format the results of an evaluation as a Markdown table, aligned as plain text too.
 
     A table of each method's means follows if there are several recordings, then the meanings of the
@@ -147,6 +158,7 @@ def markdown_table(rows: Iterable[Row]) -> str:
         rows: Rows with the keys recording, method and, of images, mse, ssim, frames and seconds.
             Others of `COLUMNS` get columns where a row has them. A number that is None, NaN or
             absent appears as "-".
+        further: Columns beside `COLUMNS`, where a row has them.
     """
     rows = list(rows)
     errors = [
@@ -160,21 +172,26 @@ def markdown_table(rows: Iterable[Row]) -> str:
     details = "".join(
         f"\n{how} ({errors.count((how, one))}): {one}\n" for how, one in dict.fromkeys(errors)
     )
-    columns = columns_of(rows)
+    columns = columns_of(rows, further)
     return (
         results_table(rows, columns)
-        + _table_of_means(rows)
+        + _table_of_means(rows, further)
         + (legend(columns) if rows else "")
         + details
     )
 
 
-def _table_of_means(rows: Sequence[Row]) -> str:
-    """Format a table of each method's means; empty where no method has several recordings."""
-    found = means(rows)
+def _table_of_means(rows: Sequence[Row], further: Sequence[Column]) -> str:
+    """Format a table of each method's means; empty where no method has several recordings.
+
+    Args:
+        rows: Rows of an evaluation.
+        further: Columns beside `COLUMNS`, where a row has them.
+    """
+    found = means(rows, further)
     if all(row["recordings"] < 2 for row in found):
         return ""
-    columns = [column for column in columns_of(rows) if column[1] in found[0]]
+    columns = [column for column in columns_of(rows, further) if column[1] in found[0]]
     table = [["mean of", "recordings", *(title for title, _, _, _ in columns)]]
     for row in found:
         numbers = [format_number(row[column[1]], column) for column in columns]

@@ -8,6 +8,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 from noise import CLIP, HEIGHT, ONE, STAMPS, WIDTH, grey, hdr_recording, small, write_config
 from numpy.typing import NDArray
 
@@ -290,6 +291,8 @@ def test_rows_against_a_reference_are_those_by_hand():
     medians = np.median(z2(image, truth).reshape(len(truth), -1), axis=1)
     np.testing.assert_allclose(row["per_frame"]["z2_median"], medians, rtol=1e-6)
     assert row["z2_median"] == pytest.approx(medians.mean())
+    surprise = -scipy.stats.norm(np.log(image + I0), variance**0.5).logpdf(np.log(truth + I0))
+    assert row["nll"] == pytest.approx((surprise + np.log(truth + I0)).mean(), rel=1e-6)
     np.testing.assert_allclose(row["per_frame"]["ssim"], metrics.ssim(image, truth), atol=1e-9)
     log_ssims = metrics.log_ssim(image, truth)
     np.testing.assert_allclose(row["per_frame"]["log_ssim"], log_ssims, atol=1e-9)

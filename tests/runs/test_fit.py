@@ -40,6 +40,7 @@ from jaxevent.runs.family import interleave
 from jaxevent.runs.fit import fit
 from jaxevent.runs.protocols import Reference, held_out
 from jaxevent.runs.reconstruction import ImageBatch, Objective, Problem, cut_windows
+from jaxevent.runs.results import format_findings
 from jaxevent.runs.scores import score
 from jaxevent.tuning import Settings, begin, optimise
 
@@ -232,6 +233,66 @@ def test_search_prepares_every_candidate():
     np.testing.assert_allclose(seen[1:7], [-1, -0.5, 0, 0.5, 1, 0])
     assert seen[7] == pytest.approx(0.37)  # the vertex of the parabola
     assert max(abs(c - 0.37) for c in seen[-8:]) <= 0.5  # the last ones, close to it
+
+
+@pytest.mark.parametrize("after", [0.9, 1.1])
+def test_a_fit_that_makes_test_data_worse_says_so(after):
+    gain = {"method": "akf", "measure": "mse", "split": "test", "before": 1.0, "after": after}
+    said = format_findings([], [gain])
+    assert ("The fit of akf made test data worse: keep" in said) == (after > 1)
+
+
+class Misleading:
+    """Batches that make a loss worse the further b is from 0, which derivatives do not see.
+
+    With batches of its own b the loss is (b - 2)^2 / 4 + 3 b^2, least at b = 2 / 13; with batches
+    that stay it is least at b = 2. The validation loss always falls towards 2.
+    """
+
+    def __call__(self, params):
+        return [jnp.asarray([3 * float(params.b) ** 2, 1.0])], [jnp.asarray([0.0, 1.0])]
+
+    @staticmethod
+    def loss(params, batch):
+        return batch[1] * (params.b - 2) ** 2 / 4 + batch[0]
+
+    def fit_loss(self, b):
+        return (b - 2) ** 2 / 4 + 3 * b**2
+
+
+@pytest.mark.parametrize("starts", [1, 3])
+def test_steps_that_make_prepared_batches_worse_are_taken_back(starts):
+    problem = Misleading()
+    settings = Settings(iterations=60, learning_rate=0.1, rounds=2, starts=starts, probe=False)
+    kept = []
+
+    def keep(run, certain):
+        kept.append(copy.deepcopy(run))
+
+    start = Toy(b=0.0)
+    fitted = optimise(problem.loss, start, ["b"], problem, (), settings, save=keep)
+    found = float(fitted.params.b)
+    assert 0.05 < found < 0.25, "the least loss is at 2 / 13"
+    assert problem.fit_loss(found) < problem.fit_loss(0.0)
+    # Taken up again anywhere, it ends the same.
+    for run in kept[2::17]:
+        again = optimise(problem.loss, start, ["b"], problem, (), settings, run=run)
+        assert float(again.params.b) == found and again.history == fitted.history
+
+
+def test_a_rough_number_is_searched_with_batches_of_each_candidate():
+    """With batches that stay the loss is least at b = 4, with those of each candidate at 1."""
+
+    def prepare(params):
+        return [params.b], []
+
+    def loss(params, batch):
+        return (batch - 1) ** 2 + 0.1 * (params.b - batch) ** 2 + 0.5 * jnp.sin(40 * params.b)
+
+    settings = Settings(iterations=1, learning_rate=1e-3, rounds=1)
+    fitted = optimise(loss, Toy(b=4.0), ["b"], prepare, (), settings)
+    assert list(fitted.rough) == ["b"]
+    assert abs(fitted.rough["b"].searched - 1) < 1
 
 
 def test_a_descent_prepares_batches_with_its_parameters():
@@ -865,6 +926,19 @@ def test_the_likelihood_sees_given_frames_only(folder, monkeypatch):
     assert seen == [(held_out(moving())[0].frames.t.tolist(), 0)]
     assert [row["split"] for row in rows] == ["test", "test"]
     assert rows[1]["params"]["c_on"] == pytest.approx(0.2, abs=1e-3)
+
+
+def test_a_fit_of_the_likelihood_gains_likelihood(folder):
+    head = 'recordings = ["moving.h5"]\nsplit = [1, 1, 1]\niterations = 1\nrounds = 1\n'
+    method = 'error = "nll"\n[[method]]\nname = "akf"\nfit = ["frame_noise"]\n'
+    fits = fit(write(folder, head + method), folder / "likely")
+    (gain,) = fits.gains
+    assert gain["measure"] == "nll"
+    before, after = (row["nll"] for row in fits if row["split"] == "test")
+    assert (gain["before"], gain["after"]) == (before, after) and before != after
+    table = (folder / "likely" / "results.md").read_text()
+    assert f"| {before:.4f} |" in table and " NLL |" in table
+    assert f"Gain of akf: nll of test data {before:.4g} before" in table
 
 
 GOOD = TWO.replace("starts = 2\n", "")

@@ -6,6 +6,7 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 from noise import hdr_recording, small, write_config
 from numpy.typing import NDArray
 
@@ -91,11 +92,15 @@ def test_rows_with_a_gap_are_those_by_hand(gap):
     np.testing.assert_allclose(row["per_frame"]["z2"], [one.mean() for one in each], rtol=1e-5)
     assert row["z2"] == pytest.approx(np.mean([one.mean() for one in each]), rel=1e-5)
     assert row["z2_median"] == pytest.approx(np.mean([np.median(one) for one in each]), rel=1e-5)
+    likelihoods = scipy.stats.norm(np.log(images + I0), VARIANCE**0.5).pdf(np.log(truth + I0))
+    nll = -np.log(likelihoods / (truth + I0))  # of intensity, not of its logarithm
+    each = [one[mask].mean() for one, mask in zip(nll, counts, strict=True)]
+    np.testing.assert_allclose(row["per_frame"]["nll"], each, rtol=1e-5)
     json.dumps(row, allow_nan=False)
     part = subset(row, [0, 1])
     assert part["moving"]["mse"] == pytest.approx(errors[:2][moves[:2]].mean(), rel=1e-6)
     plain = score(recording, METHODS["blend"], params, gap=gap)
-    assert not {"moving", "z2", "z2_median"} & set(plain) and plain["mse"] == row["mse"]
+    assert not {"moving", "z2", "z2_median", "nll"} & set(plain) and plain["mse"] == row["mse"]
     assert "z2" not in score(recording, certain(), params, gap=gap, normalise="affine")
 
 
@@ -106,7 +111,7 @@ def test_a_method_that_breaks_has_no_numbers():
         return dataclasses.replace(state, L=jnp.full_like(frame.level, jnp.nan))
 
     row = score(longer(), dataclasses.replace(certain(), predict=broken), params, moving=True)
-    for name in ("mse", "z2", "z2_median"):
+    for name in ("mse", "z2", "z2_median", "nll"):
         assert row[name] is None
     assert row["moving"]["mse"] is None and row["moving"]["share"] > 0
 
