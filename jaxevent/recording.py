@@ -626,6 +626,11 @@ class Frames:
             return images.astype(np.float32)
         return np.divide(images, np.iinfo(images.dtype).max, dtype=np.float32)
 
+    @property
+    def limits(self) -> NDArray[np.float32]:
+        """Intensities of black and of white in each frame, (frames, 2)."""
+        return np.tile(np.array([0, 1], np.float32), (len(self), 1))
+
     def check(self, width: int, height: int, source: str) -> None:
         """Check that the frames fit a sensor, are in order and hold numbers.
 
@@ -674,6 +679,40 @@ class Frames:
                 f"{source}: frame {row} has the exposure {self.exposure[row]} us; it must be "
                 "positive, or 0 where unknown"
             )
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class LinearFrames(Frames):
+    """Frames of a camera that is known; their `intensity` is linear in that of the scene.
+
+    Attributes:
+        response: Response of the camera.
+        gain: (frames,) brightness of each frame, see `Recording.gain`.
+    """
+
+    response: Response
+    gain: NDArray[np.float64]
+
+    def __post_init__(self):
+        """Take the images as they are: they are those of checked frames."""
+
+    def __getitem__(self, rows: slice | NDArray) -> "LinearFrames":
+        part = super().__getitem__(rows)
+        return LinearFrames(part.t, part.images, part.exposure, self.response, self.gain[rows])
+
+    @property
+    def intensity(self) -> NDArray[np.float32]:
+        """Images as float32 intensities: the response of the grey values over the gain."""
+        return self._linear(super().intensity)
+
+    @property
+    def limits(self) -> NDArray[np.float32]:
+        return self._linear(super().limits)
+
+    def _linear(self, grey: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Compute the intensities of grey values (frames, ...)."""
+        linear = np.asarray(self.response.intensity(grey), np.float64)
+        return (linear / self.gain.reshape(-1, *[1] * (grey.ndim - 1))).astype(np.float32)
 
 
 def _integer_times(values: Any, what: str) -> NDArray[np.int64]:
@@ -1121,6 +1160,23 @@ class Recording(HtmlRepr):
         except ValueError as error:
             also = " with extra['certainty']" if key == "response" and weights is not None else ""
             raise InputError(f"{self.name}: extra[{key!r}]{also}: {error}") from error
+
+    @property
+    def linear_frames(self) -> Frames:
+        """The frames; where the camera's response or gains are known, `LinearFrames`.
+
+        Methods reconstruct this intensity. Without a response it is the grey value.
+
+        Raises:
+            InputError: The recording has no frames, or its response or gains are not valid.
+        """
+        if self.frames is None:
+            raise InputError(f"{self.name}: holds no frames; choose a recording with frames")
+        response, gain, grey = self.response, self.gain, np.linspace(0, 1, 256)
+        if (gain == 1).all() and np.allclose(response.intensity(grey), grey, atol=1e-6):
+            return self.frames
+        frames = self.frames
+        return LinearFrames(frames.t, frames.images, frames.exposure, response, gain)
 
     def __getitem__(self, span: slice) -> "Recording":
         """Return the part with start <= t < stop; ints are us, floats s, of its clock."""

@@ -2,8 +2,10 @@
 
 "held-out" gives frames 0, 2, 4, ... and asks for images where frames 1, 3, 5, ... are, at their
 time stamps plus the method's `clock_offset`; a function of your own gets the stamps. With a `gap` g
-it gives every g-th frame, 0, g, 2 g, ..., and asks for all others. Images are clipped to [0, 1],
-the range of the truth, before they are scored.
+it gives every g-th frame, 0, g, 2 g, ..., and asks for all others. The truth is the intensity of
+the hidden frames: their grey values, and where the recording holds the camera's response or gains,
+`Recording.linear_frames`. Images are clipped to the range of the truth, [0, 1] without gains,
+before they are scored.
 
 "reference" gives the whole recording and asks for the HDR images that it keeps in
 `Recording.extra`, float linear intensities of which 1 is the frames' white, without clipping:
@@ -64,7 +66,7 @@ def held_out(recording: Recording, gap: int = DEFAULT_GAP_FRAMES) -> tuple[Recor
         )
     _need_events(recording)
     hidden = slice(1, None, 2) if gap == 2 else np.flatnonzero(np.arange(len(frames)) % gap)
-    return recording.with_frames(slice(0, None, gap)), frames[hidden]
+    return recording.with_frames(slice(0, None, gap)), recording.linear_frames[hidden]
 
 
 def frames_around(given: Frames, row: int, gap: int = DEFAULT_GAP_FRAMES) -> tuple[int, int] | None:

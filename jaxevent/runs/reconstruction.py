@@ -57,7 +57,7 @@ class ImageBatch(eqx.Module):
     prepared: PreparedImages
     truth: Float[Numeric, "times pixels"]  # intensity, 0 where unknown
     weights: Float[Numeric, "times #pixels"]  # 0 where there is no truth
-    white: Float[Numeric, ""]  # the brightest intensity that the truth can show
+    limits: Float[Numeric, "times 2"]  # the least and the greatest intensity that the truth shows
     weight: Float[Numeric, ""]  # of this batch's mean among those of other batches
 
 
@@ -76,7 +76,7 @@ class Objective:
     ln(I + dark_offset), "nll" the negative log likelihood of I if ln(I + I0) is Gaussian with the
     method's mean L and variance P. With `error` None the loss is minus the method's own log
     likelihood of the frames it was given, per frame and pixel. `clipped` says that the truth shows
-    all beyond [0, 1] as 0 or 1.
+    all beyond its limits as these.
     """
 
     method: ImageEstimator
@@ -145,7 +145,7 @@ class Objective:
         if not self.method.is_absolute:
             image, variance = self._scale(params, image, variance, batch)
         if surprising:
-            errors = self._negative_log_density(params, image, variance, batch.truth)
+            errors = self._negative_log_density(params, image, variance, batch)
         else:
             errors = self._difference(image, batch) ** 2
         counted = jnp.where(batch.weights > 0, batch.weights * errors, 0)
@@ -185,12 +185,13 @@ class Objective:
         evaluated error, equals it for images in [0, white], and has a slope wherever it is not 0.
         Args:
             image: (times, pixels) intensity.
-            batch: The true images, and their white.
+            batch: The true images, and their limits.
 
         Returns:
             (times, pixels) intensity, or ln I.
         """
-        white, truth = batch.white, batch.truth
+        black, white = jnp.split(batch.limits, 2, 1)
+        truth = batch.truth
         over = image > white
         image = jnp.where(over, white * (1 + jnp.log(jnp.where(over, image, white) / white)), image)
         if self.error == "log":
@@ -198,8 +199,8 @@ class Objective:
         else:
             difference = image - truth
         if self.clipped:
-            difference = jnp.where(truth >= 1, jnp.minimum(difference, 0), difference)
-            difference = jnp.where(truth <= 0, jnp.maximum(difference, 0), difference)
+            difference = jnp.where(truth >= white, jnp.minimum(difference, 0), difference)
+            difference = jnp.where(truth <= black, jnp.maximum(difference, 0), difference)
         return difference
 
     def _log(self, image: Array) -> Array:
@@ -210,7 +211,7 @@ class Objective:
         return jnp.sign(image) * jnp.log1p(jnp.abs(image) / self.dark_offset)
 
     def _negative_log_density(
-        self, params: FrameParams, image: Array, variance: Array, truth: Array
+        self, params: FrameParams, image: Array, variance: Array, batch: ImageBatch
     ) -> Array:
         """Compute -ln p(I) of the truth, p(I) = N(ln(I + I0); L, P) / (I + I0).
 
@@ -221,17 +222,18 @@ class Objective:
             params: `I0`, the offset inside the logarithm.
             image: (times, pixels) intensities exp(L) - I0.
             variance: (times, pixels) P, (ln I)^2.
-            truth: (times, pixels) intensities.
+            batch: The true images, and their limits.
 
         Returns:
             (times, pixels).
         """
+        truth, (black, white) = batch.truth, jnp.split(batch.limits, 2, 1)
         L, seen = jnp.log(image + params.I0), jnp.log(truth + params.I0)
         z = (seen - L) / jnp.sqrt(variance)
         surprise = 0.5 * (z**2 + jnp.log(2 * math.pi * variance)) + seen
         if self.clipped:
-            surprise = jnp.where(truth >= 1, -jax.scipy.stats.norm.logcdf(-z), surprise)
-            surprise = jnp.where(truth <= 0, -jax.scipy.stats.norm.logcdf(z), surprise)
+            surprise = jnp.where(truth >= white, -jax.scipy.stats.norm.logcdf(-z), surprise)
+            surprise = jnp.where(truth <= black, -jax.scipy.stats.norm.logcdf(z), surprise)
         return surprise
 
 
@@ -361,13 +363,13 @@ class Problem:
             padded = np.resize(places, self._rooms[s])  # repeated images count nothing
             truth = _intensity(part.truth, part.rows[places]).astype(dtype)
             weights = self._weigh(part, truth)
-            white = max(1.0, float(np.nanmax(truth, initial=0)))
+            limits = np.resize(_limits(part.truth, part.rows[places], truth), (len(padded), 2))
             spare = [(0, len(padded) - len(places)), (0, 0)]
             batch = ImageBatch(
                 prepared.take(padded),
                 np.pad(np.nan_to_num(truth), spare),
                 np.pad(weights, spare),
-                np.asarray(white, dtype),
+                limits.astype(dtype),
                 np.asarray(weights.sum(dtype=float) * truth.shape[1] / weights.shape[1], dtype),
             )
             found.append((s, jax.device_put(batch)))
@@ -406,6 +408,22 @@ def _intensity(truth: Frames, rows: NDArray[np.int64]) -> NDArray:
     if isinstance(truth, Reference):
         return np.stack([truth.truth(int(row)).ravel() for row in rows])
     return truth[rows].intensity.reshape(len(rows), -1)
+
+
+def _limits(truth: Frames, rows: NDArray[np.int64], intensity: NDArray) -> NDArray:
+    """Return the least and the greatest intensity that true images show.
+
+    Args:
+        truth: The true images.
+        rows: (images,) rows of those wanted.
+        intensity: (images, pixels) their intensity.
+
+    Returns:
+        (images, 2); of references from 0 to the brightest pixel of all, or to white.
+    """
+    if isinstance(truth, Reference):
+        return np.tile([0, max(1.0, float(np.nanmax(intensity, initial=0)))], (len(rows), 1))
+    return truth.limits[rows]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -155,7 +155,7 @@ def hidden_scores(
     Returns:
         The scores by name.
     """
-    shown, true = np.clip(image, 0, 1), truth.intensity[0]
+    shown, true = np.clip(image, *truth.limits[0]), truth.intensity[0]
     known = {"mse": mse, "ssim": ssim, **{name: MEASURE_FUNCTIONS[name] for name in measures.names}}
     broken = not np.isfinite(shown).all()
     scores: Scores = {
@@ -418,7 +418,7 @@ def _frame_before(given: Recording, t: int) -> NDArray[np.float32] | None:
     if given.frames is None:
         return None
     row = int(np.searchsorted(given.frames.t, t, "right")) - 1
-    return given.frames[row : row + 1].intensity[0] if row >= 0 else None
+    return given.linear_frames[row : row + 1].intensity[0] if row >= 0 else None
 
 
 def score(
@@ -674,7 +674,7 @@ def moving_pixels(given_recording: Recording, frame_row: int, gap_frames: int) -
     around = frames_around(given_recording.frames, frame_row, gap_frames)
     if around is None:
         return np.zeros((given_recording.height, given_recording.width), bool)
-    before, after = given_recording.frames[around[0] : around[1] + 1].intensity
+    before, after = given_recording.linear_frames[around[0] : around[1] + 1].intensity
     return np.abs(after - before) > MIN_MOTION_CHANGE
 
 

@@ -123,7 +123,7 @@ def _measure_frame_changes(
     Returns:
         Changes, ln I, and ON minus OFF events, (n,) each, of pixels with events in a few intervals.
     """
-    frames = recording.frames
+    frames = recording.linear_frames if recording.frames else None
     late = (
         round(1e6 * calibration.clock_offset.value)
         if calibration.clock_offset.is_identifiable

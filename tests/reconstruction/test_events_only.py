@@ -129,6 +129,12 @@ def test_one_frame_gives_the_scale_whatever_its_clock():
         found = image(with_frames([stamp], [0.15]))
         assert np.sqrt(np.mean((found - truth)[inner] ** 2)) < 0.16
         assert correlation(found[0], truth[0]) > 0.97
+    # A camera whose response is known shows the same.
+    plain = with_frames([0.15], [0.15])
+    curved = dataclasses.replace(plain.frames, images=np.sqrt(plain.frames.images))
+    extra = {"response": np.linspace(0, 1, 4096) ** 2}
+    through = image(dataclasses.replace(plain, frames=curved, extra=extra))
+    np.testing.assert_allclose(through, image(plain), atol=1e-3)
     # Frames without an unclipped pixel leave the image as it is.
     clipped, none = with_frames([0.1, 0.2], [0.1, 0.2], 1e6), image(translated())
     np.testing.assert_array_equal(image(clipped), none)

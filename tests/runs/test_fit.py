@@ -488,7 +488,7 @@ def test_errors_by_hand(error, clipped):
     @jax.value_and_grad
     def loss(image, weights):
         given = ScannedImages(None, image, method)
-        batch = ImageBatch(given, true, weights, jnp.asarray(white), one)
+        batch = ImageBatch(given, true, weights, jnp.asarray([[0.0, white]]), one)
         return objective(jaxevent.akf.Params(), batch)
 
     expected = [by_hand(error, i, t, clipped, white) for i, t in zip(image, truth, strict=True)]

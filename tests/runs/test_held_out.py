@@ -7,17 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from noise import hdr_recording, small, write_config
+from noise import HEIGHT, WIDTH, hdr_recording, small, write_config
 from numpy.typing import NDArray
 
 import jaxevent
+from jaxevent.errors import InputError
 from jaxevent.estimator import Estimate
 from jaxevent.methods import METHODS
 from jaxevent.reconstruction.filtering import Filter
 from jaxevent.recording import Frames, Recording
 from jaxevent.runs.evaluate import evaluate
 from jaxevent.runs.protocols import held_out
-from jaxevent.runs.reconstruction import cut_windows
+from jaxevent.runs.reconstruction import Objective, Problem, cut_windows
 from jaxevent.runs.scores import score, subset
 
 I0, VARIANCE = 0.5, 0.04
@@ -181,3 +182,49 @@ def test_fits_take_a_gap(tmp_path):
     ):
         with pytest.raises(jaxevent.InputError, match=said):
             jaxevent.fit(write_config(tmp_path, text + FIT), tmp_path / "no")
+
+
+def lit_by_a_camera() -> tuple[Recording, NDArray[np.float64]]:
+    """A still scene behind a camera of a curved response, whose exposure changes; its intensity."""
+    curve, gain = np.linspace(0, 1, 256) ** 2, np.array([1.0, 0.5, 0.7, 0.9, 1.0])
+    scene = np.random.default_rng(5).uniform(0.2, 0.95, (HEIGHT, WIDTH))
+    scene[0, 0] = 1.3  # which some of the exposures clip
+    grey = np.sqrt((scene * gain[:, None, None]).clip(0, 1))
+    t = 40_000 * np.arange(1, 6)
+    frames = Frames(t, np.rint(65535 * grey).astype(np.uint16), 0 * t)
+    extra = {"response": curve, "gain": gain}
+    return dataclasses.replace(small(), frames=frames, extra=extra), scene
+
+
+def test_intensity_is_that_of_the_scene_where_the_camera_is_known():
+    recording, scene = lit_by_a_camera()
+    frames, gain = recording.linear_frames, recording.gain
+    expected = np.minimum(scene, 1 / gain[:, None, None])
+    np.testing.assert_allclose(frames.intensity, expected, atol=1e-4)
+    np.testing.assert_allclose(frames.limits, [[0, 1 / g] for g in gain], rtol=1e-6)
+    np.testing.assert_allclose(frames[1:4:2].intensity, expected[1:4:2], atol=1e-4)
+    plain = dataclasses.replace(recording, extra={})
+    assert plain.linear_frames is plain.frames
+    levels = {"f_Q": np.ones(256)}  # of a linear response, whose certainties alone are given
+    assert dataclasses.replace(recording, extra=levels).linear_frames is recording.frames
+    with pytest.raises(InputError, match="holds no frames"):
+        print(dataclasses.replace(recording, frames=None, extra={}).linear_frames)
+
+
+def test_a_right_image_has_no_error_whatever_the_camera():
+    recording, _ = lit_by_a_camera()
+    row = score(recording, certain(), METHODS["blend"].Params(I0=I0), moving=True)
+    hidden = recording.linear_frames[1::2]
+    given = recording.with_frames(slice(0, None, 2)).linear_frames.intensity
+    for truth, (low, high), before, after, mse in zip(
+        hidden.intensity, hidden.limits, given[:-1], given[1:], row["per_frame"]["mse"], strict=True
+    ):
+        image = ((before + after) / 2).clip(low, high)
+        assert mse == pytest.approx(((image - truth) ** 2).mean(), abs=1e-9)
+    assert row["mse"] < 1e-3, "grey values taken as intensity would be wrong by 0.1"
+    assert row["moving"]["share"] < 0.5
+    # A fit compares in the same way.
+    method = METHODS["blend"]
+    problem = Problem(Objective(method), cut_windows(recording, "held-out"))
+    loss = float(problem.objective(method.Params(), problem(method.Params())[0][0]))
+    assert 0 < loss < 1e-3

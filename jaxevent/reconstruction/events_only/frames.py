@@ -80,7 +80,7 @@ class FrameMeasurements:
         self, windows: PathSource, recording: Recording, I0: float, frame_delay: float, causal: bool
     ):
         assert recording.frames is not None
-        self.windows, self.frames, self.causal = windows, recording.frames, causal
+        self.windows, self.frames, self.causal = windows, recording.linear_frames, causal
         self.I0, self.offset = I0, round(frame_delay * 1e6)
         self._span = recording.start, recording.stop
         self._factors: dict[int, tuple[float, int] | None] = {}
@@ -120,8 +120,9 @@ class FrameMeasurements:
 
     def _read(self, frame: int) -> tuple[NDArray, NDArray]:
         """Return ln(I + I0) of a frame, NaN where it is clipped, and its standard deviation."""
-        intensity = np.asarray(self.frames[frame : frame + 1].intensity[0], np.float64)
-        clear = (intensity > CLIPPED) & (intensity < 1 - CLIPPED)
+        shown = self.frames[frame : frame + 1]
+        intensity, (black, white) = shown.intensity[0].astype(np.float64), shown.limits[0].tolist()
+        clear = (intensity > black + CLIPPED) & (intensity < white - CLIPPED)
         F = np.where(clear, np.log(np.maximum(intensity, 0) + self.I0), np.nan)
         return F, PIXEL_NOISE / (np.maximum(intensity, 0) + self.I0)
 
