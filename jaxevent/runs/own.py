@@ -8,6 +8,9 @@ A metric is a function `metric(estimate, truth)` of two arrays that returns a nu
 | blob | positions (T, targets, 2) in px, NaN where unknown | every recording |
 | egomotion | components (T, d) of the model, at times that are not lost | every recording |
 
+Where a recording holds the camera's response or gains, intensity is linear, as that of
+`Recording.linear_frames`; else it is the frames' grey value.
+
 An attribute says which values are good, so that reports mark the best: `metric.higher_is_better =
 True`, or False.
 

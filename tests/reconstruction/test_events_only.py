@@ -131,7 +131,8 @@ def test_one_frame_gives_the_scale_whatever_its_clock():
         assert correlation(found[0], truth[0]) > 0.97
     # A camera whose response is known shows the same.
     plain = with_frames([0.15], [0.15])
-    curved = dataclasses.replace(plain.frames, images=np.sqrt(plain.frames.images))
+    assert plain.frames is not None
+    curved = dataclasses.replace(plain.frames, images=np.sqrt(np.asarray(plain.frames.images)))
     extra = {"response": np.linspace(0, 1, 4096) ** 2}
     through = image(dataclasses.replace(plain, frames=curved, extra=extra))
     np.testing.assert_allclose(through, image(plain), atol=1e-3)
