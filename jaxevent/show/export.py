@@ -349,7 +349,8 @@ def display_images(
     if tone == "linear":
         limits = (0.0, 1.0)
     elif tone == "display" and frames is not None and len(frames):
-        seen = [frames[row : row + 1].intensity for row in _spaced_rows(len(frames))]
+        linear = video.recording.linear_frames
+        seen = [linear[row : row + 1].intensity for row in _spaced_rows(len(frames))]
         limits = display_limits(np.concatenate(seen), tone)
     else:
         sample = video(times[_spaced_rows(len(times))])

@@ -1,3 +1,4 @@
+import dataclasses
 import re
 import resource
 import subprocess
@@ -8,11 +9,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from noise import HEIGHT, WIDTH, small
 from PIL import Image
 
 from jaxevent.egomotion.scores import METRIC_UNITS
 from jaxevent.errors import InputError, install_command
+from jaxevent.methods import METHODS
 from jaxevent.metrics import MEASURE_MEANINGS
+from jaxevent.recording import Frames
+from jaxevent.show.export import display_images
 from jaxevent.show.images import (
     comparison_figure,
     display_limits,
@@ -342,3 +347,17 @@ def test_pixels_without_bound_are_white_and_change_no_limit(how):
     assert shown[3, 4] == shown.max()
     with pytest.raises(InputError, match="not finite"):
         tone_map(np.where(np.isinf(hot), np.nan, hot), how)
+
+
+def test_the_display_is_that_of_the_scene_whatever_the_camera():
+    scene = np.random.default_rng(3).uniform(0.02, 0.3, (2, HEIGHT, WIDTH)).astype(np.float32)
+    stamps = np.array([10_000, 40_000])
+    plain = small(frames=Frames(stamps, scene, 0 * stamps))
+    curved = small(frames=Frames(stamps, np.sqrt(scene), 0 * stamps))
+    curved = dataclasses.replace(curved, extra={"response": np.linspace(0, 1, 1024) ** 2})
+    blend, times = METHODS["blend"], np.array([15_000, 30_000])
+    shown = [
+        np.stack([image for _, image in display_images(video, times, "display")]).astype(int)
+        for video in (blend.estimate(one, blend.Params()) for one in (plain, curved))
+    ]
+    assert np.abs(shown[0] - shown[1]).max() <= 1 and shown[0].max() > 200
