@@ -541,6 +541,9 @@ class ImageSource(Protocol):
         ...
 
 
+LEAST_WHITE_GREY = 0.98  # grey value from which a pixel may be white and noise
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class Frames:
     """Grey frames with the middles and lengths of their exposures.
@@ -629,7 +632,16 @@ class Frames:
     @property
     def limits(self) -> NDArray[np.float32]:
         """Intensities of black and of white in each frame, (frames, 2)."""
-        return np.tile(np.array([0, 1], np.float32), (len(self), 1))
+        return self._of_grey([0, 1])
+
+    @property
+    def least_white(self) -> NDArray[np.float32]:
+        """Least intensity that may be white and noise, so that it is only a bound, (frames,)."""
+        return self._of_grey([LEAST_WHITE_GREY])[:, 0]
+
+    def _of_grey(self, grey: list[float]) -> NDArray[np.float32]:
+        """Return the intensities of some grey values in each frame, (frames, values)."""
+        return np.tile(np.array(grey, np.float32), (len(self), 1))
 
     def check(self, width: int, height: int, source: str) -> None:
         """Check that the frames fit a sensor, are in order and hold numbers.
@@ -705,9 +717,8 @@ class LinearFrames(Frames):
         """Images as float32 intensities: the response of the grey values over the gain."""
         return self._linear(super().intensity)
 
-    @property
-    def limits(self) -> NDArray[np.float32]:
-        return self._linear(super().limits)
+    def _of_grey(self, grey: list[float]) -> NDArray[np.float32]:
+        return self._linear(super()._of_grey(grey))
 
     def _linear(self, grey: NDArray[np.float32]) -> NDArray[np.float32]:
         """Compute the intensities of grey values (frames, ...)."""

@@ -253,13 +253,24 @@ class FitResult(Generic[P]):
 
     @property
     def diverged(self) -> bool:
-        """True if no start ended at a finite loss that is at most the initial one.
+        """True if all starts ended at greater losses than the initial ones, or at none.
 
-        Even so, `params` are the best that were evaluated.
+        Both the fit loss and the validation loss have grown then. Where only the validation loss
+        has, the fit follows its own images, and early stopping keeps what was best. Even of a fit
+        that diverged `params` are the best that were evaluated.
         """
-        seen = [line for line in self.history if line[4] is not None]
-        lasts = {line[0]: line[4] for line in seen}  # by start
-        return bool(seen) and not any(loss <= seen[0][4] for loss in lasts.values())
+        starts: dict[int, tuple[list[float], list[float]]] = {}  # losses of fit and validation
+        for start, _, _, *pair in self.history:
+            for losses, loss in zip(starts.setdefault(start, ([], [])), pair, strict=True):
+                losses += [] if loss is None else [loss]
+        if not starts:
+            return False
+        first = [losses[0] for losses in starts[0]]
+        return not any(
+            math.isfinite(validation[-1])
+            and (validation[-1] <= first[1] or len(fit) > 1 and fit[-1] <= first[0])
+            for fit, validation in starts.values()
+        )
 
 
 def begin(

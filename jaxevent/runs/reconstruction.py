@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -51,13 +51,27 @@ REGION_NAMES = ("dark", "well", "bright")
 LIKELIHOOD_COLUMNS: list[Column] = [("NLL", "nll", 1, 4)]
 
 
+class TruthLimits(NamedTuple):
+    """Range of intensity that true images show.
+
+    Attributes:
+        black: (images, 1) least intensity.
+        white: (images, 1) greatest intensity.
+        least_white: (images, 1) intensity from which a pixel may be white and noise.
+    """
+
+    black: Float[Numeric, "images 1"]
+    white: Float[Numeric, "images 1"]
+    least_white: Float[Numeric, "images 1"]
+
+
 class ImageBatch(eqx.Module):
     """A batch: images as a function of parameters, the true images, and the weights of values."""
 
     prepared: PreparedImages
     truth: Float[Numeric, "times pixels"]  # intensity, 0 where unknown
     weights: Float[Numeric, "times #pixels"]  # 0 where there is no truth
-    limits: Float[Numeric, "times 2"]  # the least and the greatest intensity that the truth shows
+    limits: TruthLimits
     weight: Float[Numeric, ""]  # of this batch's mean among those of other batches
 
 
@@ -180,9 +194,11 @@ class Objective:
 
         Evaluation clips images to what the truth can show. Clipped, a pixel beyond white has no
         gradient, and as it is, a hot pixel's exp(L) outweighs all others. So intensity beyond white
-        grows with its logarithm from there on, with the same slope at white; and where the truth
-        itself is clipped, what lies beyond is no error. The result is never smaller than the
-        evaluated error, equals it for images in [0, white], and has a slope wherever it is not 0.
+        grows with its logarithm from there on, with the same slope at white. Where the truth itself
+        is clipped, what lies beyond is no error; where it is white but for noise, no more than
+        white is one. The result is never smaller than the evaluated error, equals it for images in
+        [0, white], and has a slope wherever it is not 0, but for that.
+
         Args:
             image: (times, pixels) intensity.
             batch: The true images, and their limits.
@@ -190,16 +206,18 @@ class Objective:
         Returns:
             (times, pixels) intensity, or ln I.
         """
-        black, white = jnp.split(batch.limits, 2, 1)
+        black, white, least_white = batch.limits
         truth = batch.truth
         over = image > white
-        image = jnp.where(over, white * (1 + jnp.log(jnp.where(over, image, white) / white)), image)
+        beyond = jnp.log(jnp.where(over, image, white) / white)
+        if self.clipped:
+            beyond = jnp.where(truth >= least_white, 0, beyond)
+        image = jnp.where(over, white * (1 + beyond), image)
         if self.error == "log":
             difference = self._log(image) - self._log(truth)
         else:
             difference = image - truth
         if self.clipped:
-            difference = jnp.where(truth >= white, jnp.minimum(difference, 0), difference)
             difference = jnp.where(truth <= black, jnp.maximum(difference, 0), difference)
         return difference
 
@@ -227,12 +245,12 @@ class Objective:
         Returns:
             (times, pixels).
         """
-        truth, (black, white) = batch.truth, jnp.split(batch.limits, 2, 1)
+        truth, (black, _, least_white) = batch.truth, batch.limits
         L, seen = jnp.log(image + params.I0), jnp.log(truth + params.I0)
         z = (seen - L) / jnp.sqrt(variance)
         surprise = 0.5 * (z**2 + jnp.log(2 * math.pi * variance)) + seen
         if self.clipped:
-            surprise = jnp.where(truth >= white, -jax.scipy.stats.norm.logcdf(-z), surprise)
+            surprise = jnp.where(truth >= least_white, -jax.scipy.stats.norm.logcdf(-z), surprise)
             surprise = jnp.where(truth <= black, -jax.scipy.stats.norm.logcdf(z), surprise)
         return surprise
 
@@ -363,13 +381,16 @@ class Problem:
             padded = np.resize(places, self._rooms[s])  # repeated images count nothing
             truth = _intensity(part.truth, part.rows[places]).astype(dtype)
             weights = self._weigh(part, truth)
-            limits = np.resize(_limits(part.truth, part.rows[places], truth), (len(padded), 2))
+            limits = [
+                np.resize(one, (len(padded), 1)).astype(dtype)
+                for one in _limits(part.truth, part.rows[places], truth)
+            ]
             spare = [(0, len(padded) - len(places)), (0, 0)]
             batch = ImageBatch(
                 prepared.take(padded),
                 np.pad(np.nan_to_num(truth), spare),
                 np.pad(weights, spare),
-                limits.astype(dtype),
+                TruthLimits(*limits),
                 np.asarray(weights.sum(dtype=float) * truth.shape[1] / weights.shape[1], dtype),
             )
             found.append((s, jax.device_put(batch)))
@@ -410,8 +431,8 @@ def _intensity(truth: Frames, rows: NDArray[np.int64]) -> NDArray:
     return truth[rows].intensity.reshape(len(rows), -1)
 
 
-def _limits(truth: Frames, rows: NDArray[np.int64], intensity: NDArray) -> NDArray:
-    """Return the least and the greatest intensity that true images show.
+def _limits(truth: Frames, rows: NDArray[np.int64], intensity: NDArray) -> TruthLimits:
+    """Return the range of intensity that true images show.
 
     Args:
         truth: The true images.
@@ -419,11 +440,13 @@ def _limits(truth: Frames, rows: NDArray[np.int64], intensity: NDArray) -> NDArr
         intensity: (images, pixels) their intensity.
 
     Returns:
-        (images, 2); of references from 0 to the brightest pixel of all, or to white.
+        The limits; of references from 0 to the brightest pixel of all, at least 1.
     """
     if isinstance(truth, Reference):
-        return np.tile([0, max(1.0, float(np.nanmax(intensity, initial=0)))], (len(rows), 1))
-    return truth.limits[rows]
+        white = np.full((len(rows), 1), max(1.0, float(np.nanmax(intensity, initial=0))))
+        return TruthLimits(0 * white, white, white)
+    black, white = truth.limits[rows].T[:, :, None]
+    return TruthLimits(black, white, truth.least_white[rows, None])
 
 
 @dataclasses.dataclass(frozen=True)

@@ -32,7 +32,7 @@ from jaxevent.metrics import (
 from jaxevent.parameters import check_choice
 from jaxevent.reconstruction.augment import FrameParams, calibrated_values
 from jaxevent.reconstruction.estimator import ImageEstimator
-from jaxevent.recording import Frames, Recording
+from jaxevent.recording import LEAST_WHITE_GREY, Frames, Recording
 from jaxevent.runs.config import (
     CALIBRATE_CHECK,
     FLAG_CHECK,
@@ -170,7 +170,7 @@ def hidden_scores(
         # A black or clipped pixel tells a bound of the intensity, not the intensity.
         grey = np.asarray(truth.images)[0]
         white = 1 if grey.dtype.kind == "f" else np.iinfo(grey.dtype).max
-        unclipped = (grey > 0) & (grey < white)
+        unclipped = (grey > 0) & (grey < LEAST_WHITE_GREY * white)
         judged = _judge_variance(image.astype(np.float64), variance, true.astype(np.float64), I0)
         judged_scores = judged.scores(unclipped)
         scores |= dict.fromkeys(judged_scores, math.nan) if broken else judged_scores
@@ -455,7 +455,8 @@ def score(
     Where the method estimates a variance, `z2` is the mean of (error of ln(I + I0))^2 / variance,
     over all pixels, 1 for honest variances, and `z2_median` the mean over images of its median,
     then 0.45 if errors are Gaussian. `nll` is the mean of -ln p of the true intensities, if
-    ln(I + I0) is Gaussian. Black and clipped pixels of hidden frames do not count.
+    ln(I + I0) is Gaussian. Pixels of hidden frames that are black, or white but
+    for noise, do not count.
 
     Rows of "reference" have also `log_mse` and `log_ssim`; `clip`, the bounds of the `regions`
     "bright", "dark" and "well"; and of each of those its `share` of all pixels and, over its pixels
