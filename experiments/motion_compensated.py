@@ -8,6 +8,7 @@
     street   davis346_street, every 2nd, 4th, 8th; all pixels, and where something moves
     objects  simulated objects, frames at 25 and 100 Hz, halfway between frames
     blur     pans and objects, long exposures: at the frames' middles, and halfway between them
+    delay    the same of two seeds, `mc` calibrated, with parts of the delay of events of `aks`
 
 Of hidden frames a few are scored, evenly chosen among those that lie between given ones. Simulated
 recordings are those of seeds 101 to 103; the smoother and the filter are fitted to seeds 1 to 3.
@@ -48,6 +49,9 @@ CHOOSING, SCORING = (1, 2, 3), (101, 102, 103)  # seeds
 RATES = (25.0, 100.0)  # Hz
 IMAGES = {2: 10, 4: 10, 8: 10, 16: 8}  # by gap
 BLURS = ((0.02, 0.05, 0.1), (25.0, 100.0, 300.0))  # s; px/s
+DELAY_BLURS = ((0.002, 0.02, 0.05), (100.0, 300.0))
+DELAY_SEEDS = (11, 101)  # for choosing and for scoring
+PARTS = (0.0, 0.5, 1.0)  # of the delay of `aks`
 
 FIT = """
 recordings = [{recordings}]
@@ -327,10 +331,29 @@ def blur(store: Store, folder: Path, fits: Callable[[Path], Chosen]) -> None:
         store.add(cell, methods, _scorer(recording, truth_of(source, t), None, parts))
 
 
-def blurred_recordings(folder: Path) -> Iterator[tuple[Row, IntensitySource, Recording]]:
+def delay(store: Store, folder: Path) -> None:
+    """Score `mc` with parts of the delay of `aks`."""
+    mc, aks = jaxevent.METHODS["mc"], jaxevent.aks
+    for seed in DELAY_SEEDS:
+        for cell, source, recording in blurred_recordings(folder, DELAY_BLURS, seed):
+            chosen = mc.Params.for_recording(recording)
+            whole = float(aks.Params.for_recording(recording).event_delay)
+            t, parts = at_and_between(recording)
+            methods = {
+                f"{part:g}": (mc, chosen.replace(event_delay=part * whole)) for part in PARTS
+            }
+            more = {"seed": seed, "delay_ms": 1e3 * whole}
+            store.add(
+                {**cell, **more}, methods, _scorer(recording, truth_of(source, t), None, parts)
+            )
+
+
+def blurred_recordings(
+    folder: Path, blurs: tuple[tuple[float, ...], tuple[float, ...]] = BLURS, seed: int = SCORING[0]
+) -> Iterator[tuple[Row, IntensitySource, Recording]]:
     """Iterate over recordings of long exposures, with scene, exposure and speed."""
-    light, seed = make_panorama(), SCORING[0]
-    for kind, exposure, speed in itertools.product(("pan", "objects"), *BLURS):
+    light = make_panorama()
+    for kind, exposure, speed in itertools.product(("pan", "objects"), *blurs):
         rate = min(25.0, 0.8 / exposure)
         camera = sensor(rate, exposure, max(8, round(2 * exposure * speed)))
         size, duration = (160, 120), 7 / rate + exposure
@@ -339,7 +362,7 @@ def blurred_recordings(folder: Path) -> Iterator[tuple[Row, IntensitySource, Rec
             if kind == "objects"
             else Pan(light, size, duration, speed, seed)
         )
-        name = f"{kind}_{1e3 * exposure:g}ms_{speed:g}px.h5"
+        name = f"{kind}_{1e3 * exposure:g}ms_{speed:g}px{f'_{seed}' * (seed != SCORING[0])}.h5"
         recording = load_or_simulate(folder / "recordings" / name, source, camera, seed)
         yield {"scene": kind, "exposure_ms": 1e3 * exposure, "speed": speed}, source, recording
 
@@ -383,7 +406,7 @@ def table(
 
 def main() -> None:
     parser = command_line(__doc__, out=True)
-    tables = ("slider", "street", "objects", "blur")
+    tables = ("slider", "street", "objects", "blur", "delay")
     parser.add_argument("--params", type=Path, help="folder of a fit to slider_depth")
     parser.add_argument("--street-params", type=Path, help="of one to davis346_street; or the same")
     parser.add_argument("--methods", nargs="+", default=METHODS, metavar="NAME")
@@ -436,6 +459,16 @@ def _tables(
         }  # fmt: skip
         rows = store.means(list(how), names)
         yield "blur", table(rows, how, (*IMAGE_COLUMNS, *parts))
+    if "delay" in wanted:
+        store = Store(out / "delay.json")
+        delay(store, out)
+        parts = (("at frames", "at_frames", 100, 4), ("between", "between", 100, 4))
+        how = {
+            "seed": "seed", "scene": "scene", "exposure_ms": "exposure (ms)", "speed": "px/s",
+            "delay_ms": "delay (ms)", "method": "part",
+        }  # fmt: skip
+        rows = store.means(list(how), names)
+        yield "delay", table(rows, how, (IMAGE_COLUMNS[0], *parts))
 
 
 if __name__ == "__main__":
