@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from jaxevent.events import is_hot
 
-MIN_EVENTS = 3  # of a hot pixel in three quarters of the parts
+MIN_EVENTS = 2  # of a hot pixel in each of three quarters of the parts
 RATIO = 3  # to the median pixel of the 5 x 5 around
 MIN_PARTS = 4
 MAX_EVENTS_SHARE = 0.05  # of all events, by hot pixels
@@ -18,9 +18,10 @@ MIN_BUSY_EVENTS = 8  # of pixels on both sides of another: by chance it has none
 def find_hot_pixels(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
     """Find hot pixels in counts of several parts of a recording.
 
-    What moves passes a pixel in some parts and moves on. A hot pixel fires in all of them, more
-    than most pixels around it, though a fifth of these may be hot too. Where many pixels are dead,
-    those that fire are compared with each other.
+    What moves passes a pixel in some parts and moves on. A hot pixel fires in all of them. In the
+    quietest three quarters of its parts together it has more events than most pixels around it have
+    in theirs, though a fifth of these may be hot too. Where many pixels are dead, those that fire
+    are compared with each other.
 
     Args:
         counts: (parts, height, width) events of each pixel in parts of similar length.
@@ -34,8 +35,10 @@ def find_hot_pixels(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
         return hot
     if measure_dead_share(counts, hot) > MAX_DEAD_SHARE:
         hot, counted = np.zeros(total.shape, bool), total > 0
-    steady = np.sort(counts, axis=0)[len(counts) // 4]
-    return hot | ((steady >= MIN_EVENTS) & _exceeds_median(steady, counted))
+    quietest_first = np.sort(counts, axis=0)
+    steady = quietest_first[len(counts) // 4] >= MIN_EVENTS
+    events = quietest_first[: 3 * len(counts) // 4].sum(0)
+    return hot | (steady & _exceeds_median(events, counted))
 
 
 def _exceeds_median(counts: NDArray[np.integer], counted: NDArray[np.bool_]) -> NDArray[np.bool_]:
