@@ -166,11 +166,10 @@ class Settings:
     to where it was then, and its learning rate is halved. The result is the best point evaluated,
     with parameters within their bounds. `starts` starting points are optimised at once: the given
     one, and others drawn around it with a standard deviation of `spread` in the unconstrained
-    numbers. A step uses
-    `batch` batches, drawn without replacement; None uses all. `forward` chooses forward or reverse
-    differentiation; None takes the faster. With `probe` the loss is probed before the first step:
-    numbers whose gradient does not predict how the loss changes (`gradient_skill`) are searched
-    first.
+    numbers. A step uses `batch` batches, drawn without replacement; None uses all. `forward`
+    chooses forward or reverse differentiation; None takes the faster. With `probe` the loss is
+    probed before the first step: numbers whose gradient does not predict how the loss changes
+    (`gradient_skill`) are searched first.
     """
 
     iterations: int = 300
@@ -265,7 +264,7 @@ class FitResult(Generic[P]):
                 losses += [] if loss is None else [loss]
         if not starts:
             return False
-        first = [losses[0] for losses in starts[0]]
+        first = [losses[0] if losses else math.inf for losses in starts[0]]
         return not any(
             math.isfinite(validation[-1])
             and (validation[-1] <= first[1] or len(fit) > 1 and fit[-1] <= first[0])
