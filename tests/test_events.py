@@ -279,3 +279,8 @@ def test_tables():
     assert list(table) == ["t", "x", "y", "p"]
     assert [tuple(row) for row in table.itertuples(index=False)] == rows(part)
     assert table.dtypes.tolist() == [np.int64, np.uint16, np.uint16, bool]
+
+
+def test_images_that_do_not_fit_in_memory_are_refused():
+    with pytest.raises(InputError, match="need [0-9,]+ GB of memory; ask for fewer"):
+        events.voxel_grid(drawn(), 10**12, size=(WIDTH, HEIGHT))

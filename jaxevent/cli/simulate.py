@@ -184,6 +184,11 @@ def _simulate_video(
     from jaxevent.io import save
     from jaxevent.io.output import complete
 
+    if not video.exists():
+        raise InputError(
+            f"{video}: there is no such video or folder of images; correct the path, or give a "
+            "scene by --scene, --objects, --blobs or --motion"
+        )
     try:
         factor = float(speed or 1)
     except ValueError:

@@ -481,9 +481,11 @@ def motion_from_table(
     )
     if "lost" in table.columns:
         numbers = numbers[~(np.asarray(table["lost"], float) > 0)]
+    if not len(numbers):
+        raise InputError(f"{path}: holds no motion; give a {row} for each time")
     finite = np.isfinite(numbers).all(1)
-    if not len(numbers) or not finite.all():
-        line = int(np.argmin(finite)) + first if len(numbers) else first
+    if not finite.all():
+        line = int(np.argmin(finite)) + first
         raise InputError(
             f"{path}: {row} {line} holds no numbers; give them, or leave the {row} out"
         )

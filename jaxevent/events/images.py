@@ -121,6 +121,9 @@ def _accumulate(
 
     Returns:
         (planes, H, W).
+
+    Raises:
+        InputError: The images do not fit in memory.
     """
     if isinstance(part, DeviceEvents):
         width, height = part.size
@@ -131,7 +134,15 @@ def _accumulate(
             total = total.at[at].add(weight, mode="drop")
         return total.reshape(planes, height, width)
     width, height = size_of(part, size)
-    total = np.zeros(planes * height * width, np.float64 if kind == np.float32 else kind)
+    sums = np.dtype(np.float64 if kind == np.float32 else kind)
+    try:
+        total = np.zeros(planes * height * width, sums)
+    except MemoryError:
+        needed = planes * height * width * sums.itemsize / 2**30
+        raise InputError(
+            f"{planes} images of {width}x{height} pixels need {needed:,.0f} GB of memory; ask for "
+            "fewer"
+        ) from None
     for events in _read(part, *span):
         pixel = events.y.astype(np.intp) * width + events.x
         for plane, weight in increments(events, np):
@@ -232,7 +243,7 @@ def voxel_grid(
         (bins, H, W) float32.
 
     Raises:
-        InputError: There is no bin.
+        InputError: There is no bin, or the bins do not fit in memory.
     """
     if isinstance(bins, bool) or not isinstance(bins, int | np.integer) or bins < 1:
         raise InputError(

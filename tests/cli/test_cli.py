@@ -877,7 +877,8 @@ def test_simulate_a_video(film, capsys):
         ("film --cut 200", "200"),
         ("film --start 5", "film"),
         ("film --max-size 3", "max_size = 3"),
-        ("none.mp4", "none.mp4: there is no such file"),
+        ("none.mp4", "none.mp4: there is no such video or folder"),
+        ("lake", "give a scene by --scene"),
     ],
 )
 def test_bad_ways_to_simulate(options, said, film, capsys, monkeypatch):

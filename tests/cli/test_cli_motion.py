@@ -556,3 +556,10 @@ def test_a_table_of_states_is_exact(tmp_path):
     assert lines == ["t,vx,vy,sigma_vx,sigma_vy,lost", "1.5,1.5,-2.0,2.0,3.0,0", "2.5,,,,,1"]
     known = egomotion.truth.read_motion(tmp_path / "a.csv", "planar")  # the row that is found
     assert known.t.tolist() == [1_500_000] and known.values.tolist() == [[1.5, -2.0]]
+
+
+@pytest.mark.parametrize("lines", ["t,vx,vy\n", "t,vx,vy,lost\n1.5,,,1\n"])
+def test_a_table_without_motion_says_so(tmp_path, lines):
+    (tmp_path / "a.csv").write_text(lines)
+    with pytest.raises(InputError, match="a.csv: holds no motion; give a line for each time"):
+        egomotion.truth.read_motion(tmp_path / "a.csv", "planar")
